@@ -1,19 +1,21 @@
 """The forest: who starts and arrives where, what counts as touching and reaching, and what a policy is told."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
 from jaxdrones.sensing import Cylinder, Scene, collisions
 
 ENV = make("forest", vision=())
 TASK = ENV.task
-advance = jax.jit(lambda world: TASK.advance(TASK, world))
-first_world = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
+advance = jit_unoptimized(lambda world: TASK.advance(TASK, world))
+first_world = functools.cache(lambda: jit_unoptimized(ENV.reset)(jax.random.key(0))[1])
 
 
 def moved_to(pos):
@@ -36,7 +38,6 @@ def test_starts_and_goals_are_never_in_an_obstacle():
     assert jnp.min(starts(jax.random.split(jax.random.key(1), 10_000))) > 0.9  # m
 
 
-@pytest.mark.slow
 def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     assert moved_to((19.1, 0, 1.5))["reached"][0] and not moved_to((18.9, 0, 1.5))["reached"][0]
     trees = first_world().scene.cylinders
@@ -45,6 +46,26 @@ def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     beside = beside.at[2].set(1.5)
     assert moved_to(beside + jnp.array([0.01, 0, 0]))["touched"][0]
     assert moved_to((5.0, 0.0, 0.01))["touched"][0]  # the ground
+
+
+def test_the_path_is_summed_and_progress_is_what_the_goal_comes_closer():
+    world = first_world()
+    world = world.replace(variables=world.variables | {"start": jnp.array([[0, 0, 1.5]]), "path": jnp.zeros(1)})
+    places = jnp.array([[0, 0, 1.5], [3, 4, 1.5], [3, 0, 1.5]])
+    for before, after in itertools.pairwise(places):
+        drones = world.drones.replace(pos=after[None])
+        variables = advance(world.replace(drones=drones, variables=world.variables | {"pos": before[None]}))
+        world = world.replace(drones=drones, variables=variables)
+    assert world.variables["path"][0] == 9.0
+    np.testing.assert_allclose(world.variables["progress"], np.hypot(17, 4) - 17, rtol=1e-12)
+    np.testing.assert_allclose(TASK.metrics["detour"](TASK, world), 3.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("pos", "out"), [((10, 4.9, 1), 0), ((10, -5.1, 1), 1), ((10, 5.1, 1), 1), ((30, 0, 1), 1)])
+def test_a_drone_that_leaves_the_strip_of_ten_meters_ends_its_episode(pos, out):
+    world = first_world()
+    drones = world.drones.replace(pos=jnp.array([pos], float))
+    assert TASK.terminations["left"](TASK, world.replace(drones=drones)).tolist() == [bool(out)]
 
 
 @pytest.mark.slow

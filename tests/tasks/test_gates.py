@@ -21,9 +21,9 @@ advance = jit_unoptimized(lambda world: ENV.task.advance(ENV.task, world))
 start_of_race = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
 
 
-def moved(start, end, index=0):
+def moved(start, end, index=0, steps=0):
     """The task's variables after a drone went from one place to another within a step."""
-    world = start_of_race()
+    world = start_of_race().replace(step=jnp.asarray(steps, jnp.int32))
     variables = world.variables | {"pos": jnp.array([start]), "index": jnp.array([index])}
     world = world.replace(drones=world.drones.replace(pos=jnp.array([end])), variables=variables)
     return advance(world)
@@ -64,6 +64,13 @@ def test_a_gate_counts_in_its_direction_and_in_its_turn():
 def test_after_the_last_gate_nothing_counts():
     after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(THROUGH, GATES[-1]), index=len(GATES))
     assert after["index"][0] == len(GATES) and after["progress"][0] == 0
+
+
+def test_the_lap_time_runs_to_the_last_gate():
+    there = jnp.array([5.0, 5.0, 1.0])
+    racing, done = (moved(there, there, index, steps=120) for index in (0, len(GATES)))
+    np.testing.assert_allclose(racing["lap_time"], 120 * ENV.dt)
+    assert done["lap_time"].tolist() == start_of_race().variables["lap_time"].tolist() != racing["lap_time"].tolist()
 
 
 def test_poles_are_hit_as_high_as_they_are():

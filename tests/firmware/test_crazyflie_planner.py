@@ -5,11 +5,24 @@ import numpy as np
 from jaxdrones.firmware.crazyflie.planner import Goal, Trajectory, go_to
 
 
+START = Goal(np.array([0.0, 1, 2]), np.ones(3), np.zeros(3), 0.1, 0.2)
+PIECES = go_to(START, np.array([3.0, 0, 1]), 0.7, 2.0, begin=0.0).pieces
+
+
+def test_a_trajectory_that_is_turned_and_shifted_turns_the_heading_with_the_path():
+    turn, shift = 0.9, np.array([3.0, -1.0, 0.5])
+    plain, moved = Trajectory(PIECES, 0.0), Trajectory(PIECES, 0.0, shift=shift, turn=turn)
+    cos, sin = np.cos(turn), np.sin(turn)
+    about = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    for t in 0.3, 1.1:
+        a, b = plain.at(t), moved.at(t)
+        np.testing.assert_allclose(b.pos, about @ a.pos + shift, atol=1e-12)
+        np.testing.assert_allclose([b.vel, b.acc], [about @ a.vel, about @ a.acc], atol=1e-12)
+        np.testing.assert_allclose([b.yaw, b.yaw_rate], [a.yaw + turn, a.yaw_rate], atol=1e-12)
+
+
 def test_a_trajectory_backwards_is_that_of_the_reversed_time():
-    pieces = go_to(
-        Goal(np.array([0.0, 1, 2]), np.ones(3), np.zeros(3), 0.1, 0.2), np.array([3.0, 0, 1]), 0.7, 2.0, begin=0.0
-    ).pieces
-    there, back = (Trajectory(pieces, 5.0, 1.5, backwards) for backwards in (False, True))
+    there, back = (Trajectory(PIECES, 5.0, 1.5, backwards) for backwards in (False, True))
     for t in 0.1, 0.4, 1.9, 2.6:
         a, b = there.at(5 + t), back.at(5 + 3 - t)
         for name, sign in ("pos", 1), ("vel", -1), ("acc", 1), ("yaw", 1), ("yaw_rate", -1):

@@ -4,7 +4,6 @@ import numpy as np
 
 from jaxdrones.firmware.crazyflie.planner import Goal, Trajectory, go_to
 
-
 START = Goal(np.array([0.0, 1, 2]), np.ones(3), np.zeros(3), 0.1, 0.2)
 PIECES = go_to(START, np.array([3.0, 0, 1]), 0.7, 2.0, begin=0.0).pieces
 

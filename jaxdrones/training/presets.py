@@ -126,8 +126,15 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "bptt"): dict(
         updates=600, hidden_sizes=(64, 64), gradient="exact", learning_rate=2e-2, restart_fraction=0.2
     ),
+    # Rotors that lag filter the noise of actions; a policy trained with more noise oscillates less.
     ("hover", "ppo"): dict(
-        updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01, anneal_fraction=0.6
+        updates=750,
+        critic_hidden_sizes=(64, 64),
+        privileged_critic=True,
+        target_kl=0.01,
+        init_std=0.6,
+        min_std=0.2,
+        anneal_fraction=0.8,
     ),
 }
 _ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
@@ -154,6 +161,9 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "transport": dict(substeps=2),
 }
 """Options of the environment in training, where they differ from those in flight."""
+_REALISTIC_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
+    "hover": dict(delay=(0.0, 0.05)),  # s; in flight up to 40 ms, at which policies trained up to it oscillate
+}
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
 
 
@@ -177,14 +187,15 @@ def preset(
         realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters; the policy also
             observes rotor speeds and its last five actions. With `any`, every episode has a random vehicle, and the
             policy observes its last action and commands `throttle`, which depend on no parameter of the vehicle.
-        practice: whether to make the environment of training, possibly with easier starts than that of flight.
+        practice: whether to make the environment of training, possibly with easier starts, or longer delays, than that
+            of flight.
         **options: options of `jaxdrones.make`.
     """
     config = learner(algorithm).Config()
     if realistic and task in ("hover", "recovery", "landing"):
         options = (_ANY_VEHICLE if realistic == "any" else {"observation": _DELAYED_OBSERVATION}) | options
     if practice and isinstance(task, str):
-        options = _practice_options(task, options) | options
+        options = _practice_options(task, realistic, options) | options
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
         settings = _CONFIGS.get((task, algorithm), {})
@@ -199,9 +210,11 @@ def preset(
     return env, config
 
 
-def _practice_options(task: str, options: dict[str, Any]) -> dict[str, Any]:
+def _practice_options(task: str, realistic: bool | str, options: dict[str, Any]) -> dict[str, Any]:
     """Options of the environment in training; with contact, physics steps are not longer than in flight."""
     practice = _PRACTICE_OPTIONS.get(task, {})
+    if realistic is True:
+        practice = practice | _REALISTIC_PRACTICE_OPTIONS.get(task, {})
     if not (options.get("obstacles") or options.get("contact")):
         return practice
     return {name: value for name, value in practice.items() if name != "substeps"}

@@ -73,7 +73,7 @@ class Pilot:
     horizon: int = -1
     """Control steps whose setpoints a controller observes; -1 for a policy with observations of its own."""
     realistic: bool = False
-    """Whether a policy is trained with drawn constants, noise and delays of 0 to 40 ms, and observes five actions."""
+    """Whether a policy is trained with drawn constants, noise and delays of 0 to 50 ms, and observes five actions."""
     action: str = "rpm"
     """Action type."""
     needs: str = ""

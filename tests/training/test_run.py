@@ -112,6 +112,13 @@ def test_a_recipe_survives_json(realistic):
     assert recipe.env().observation_size > 0
 
 
+def test_realistic_hover_trains_with_longer_delays_than_in_flight_unless_a_delay_is_given():
+    recipe, given = Recipe.of("hover", realistic=True), Recipe.of("hover", realistic=True, delay=0.01)
+    assert recipe.env().delay == (0.0, 0.04) and recipe.env(practice=True).delay == (0.0, 0.05)
+    assert given.env(practice=True).delay == given.env().delay == (0.01, 0.01)
+    assert Recipe.of("hover", realistic="any").env(practice=True).delay == (0.0, 0.04)
+
+
 def test_a_full_disk_is_reported_with_its_folder_before_training(tmp_path, monkeypatch):
     def full(self, content):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -4,6 +4,7 @@ import ast
 import importlib
 import json
 import re
+import subprocess
 
 import pytest
 from documents import LANGUAGES, PAGES, ROOT, blocks, run_python
@@ -33,6 +34,25 @@ def test_every_file_that_a_page_names_is_there():
     path = re.compile(r"(?<![\w/])(?:assets|benchmarks|docs|notebooks|tests|\.ci)/[\w./-]*\w")
     missing = [(p.name, name) for p in PAGES for name in path.findall(p.read_text()) if not (ROOT / name).exists()]
     assert missing == []
+
+
+def test_every_commit_of_a_number_is_in_the_history():
+    """A commit that was rewritten afterwards reproduces nothing."""
+    named = {
+        (page.name, commit)
+        for page in PAGES
+        for found in re.findall(
+            r"commits? ([0-9a-f]{7}(?:(?:, | and | \(\"now\"\) and )[0-9a-f]{7})*)", page.read_text()
+        )
+        for commit in re.findall(r"[0-9a-f]{7}", found)
+    }
+    assert len(named) > 20
+    listed = subprocess.run(["git", "rev-list", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
+    history = {commit[:7] for commit in listed.stdout.split()}
+    missing = {(page, commit) for page, commit in named if commit not in history}
+    if missing == named:
+        pytest.skip("the history is not here")
+    assert missing == set()
 
 
 @pytest.mark.parametrize(

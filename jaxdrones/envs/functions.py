@@ -22,6 +22,7 @@ from jaxdrones.user_code import place
 DrawScene = Callable[[jax.Array], Scene]
 """(key) -> scene of an episode."""
 _NUMBERS = "biuf"  # kinds of dtypes
+_DRAWS = 64  # random keys, with which functions of users are called
 _processes: set[int] = set()  # in which environments were made
 
 
@@ -121,9 +122,6 @@ def _check_values(what: str, function: Callable, draw: Callable, check: Callable
             check(jax.tree.map(lambda x, i=i: x[i], drawn))
     except UserError as error:
         raise UserError(f"{_where(what, function)} returns what cannot fly: {error}") from None
-
-
-_DRAWS = 64  # random keys
 
 
 def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:

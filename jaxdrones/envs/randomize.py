@@ -57,7 +57,7 @@ def shifted(field: Field, low: float, high: float) -> Randomization:
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
         if field in POSITIVE and is_concrete(value) and (lowest := float(np.asarray(value).min())) + low <= 0:
-            raise UserError(f"shifted({field!r}, {low}, {high}): {field} is {lowest:g}; give a lower bound above it")
+            raise UserError(f"the lower bound of {field}, which is {lowest:g}, is {low:g}; give more than {-lowest:g}")
         return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
 
     return described(f"{field} plus U({low:g}, {high:g}), each entry", randomize)

@@ -188,6 +188,8 @@ def make(
 
 
 _MAX_STEPS = 1e9  # control steps of an episode, which are counted by an integer of 32 bits
+_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
+_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
 _PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), randomize=(), noise=None, delay=0.0)
 _REALISTIC: dict[str, Any] = dict(
     rotors="lagging", effects=("drag",), randomize=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
@@ -267,10 +269,6 @@ def _vision(
     if camera is not None:
         raise UserError("camera is given without vision; give for example vision=('depth',), or leave it out")
     return None
-
-
-_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
-_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
 
 
 def _check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:

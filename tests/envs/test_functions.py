@@ -99,7 +99,7 @@ def test_what_a_function_of_a_task_returns_is_refused_where_nothing_can_be_flown
         (lambda key, params: params.mass, r"a randomization returns .*; return params.replace"),
         (
             shifted("inertia", -2e-5, 1e-5),
-            r"shifted\('inertia', -2e-05, 1e-05\): inertia is 1.4e-05; give a lower bound",
+            "the lower bound of inertia, which is 1.4e-05, is -2e-05; give more than -1.4e-05",
         ),
     ],
 )

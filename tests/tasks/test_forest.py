@@ -85,7 +85,9 @@ def test_what_is_touched_is_what_collisions_tell_in_one_world_and_in_many():
 
     expected = jax.jit(jax.vmap(by_geometry))(worlds)
     assert 3 < jnp.sum(expected) < 100
-    np.testing.assert_array_equal(jax.jit(jax.vmap(lambda world: advance(world)["touched"]))(worlds), expected)
+    np.testing.assert_array_equal(
+        jax.jit(jax.vmap(lambda world: TASK.advance(TASK, world)["touched"]))(worlds), expected
+    )
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Rotor speeds and rotor wrenches (paper, equations 1 to 3)."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -59,25 +58,14 @@ def induced_speed(params: Params, rpm: Float[Array, "*n"]) -> Float[Array, "*n"]
     return rpm * jnp.sqrt(params.kf / (2 * AIR_DENSITY * area))
 
 
-@jax.custom_jvp
 def lost_share(loss: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Limited loss of thrust as a fraction, given that of the linear blade-element law; negative for a gain.
 
     Up to one half it is linear. Beyond, where blades stall, it tends smoothly to one: thrust stays positive and at most
     doubles. The form of this limit is an assumption.
     """
-    return jnp.clip(loss, -0.5, 0.5) + jnp.sign(loss) * (1 - _slope(loss)) / 2
-
-
-@lost_share.defjvp
-def _(at: tuple, change: tuple) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    (loss,) = at
-    return lost_share(loss), _slope(loss) * change[0]
-
-
-def _slope(loss: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Derivative of the limited with respect to the linear loss."""
-    return jnp.exp(-jnp.maximum(2 * jnp.abs(loss) - 1, 0))
+    beyond = jnp.exp(-jnp.maximum(-2 * loss - 1, 0)) - jnp.exp(-jnp.maximum(2 * loss - 1, 0))
+    return jnp.clip(loss, -0.5, 0.5) + beyond / 2
 
 
 def rotor_wrench(params: Params, state: State) -> Wrench:

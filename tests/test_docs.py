@@ -50,8 +50,8 @@ def test_every_commit_of_a_number_is_in_the_history():
     listed = subprocess.run(["git", "rev-list", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
     history = {commit[:7] for commit in listed.stdout.split()}
     missing = {(page, commit) for page, commit in named if commit not in history}
-    if missing == named:
-        pytest.skip("the history is not here")
+    if missing == named or (ROOT / ".git" / "shallow").exists():
+        pytest.skip("the whole history is not here")
     assert missing == set()
 
 

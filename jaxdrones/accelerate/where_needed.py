@@ -50,7 +50,7 @@ def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | No
         rest = () if otherwise is None else jax.tree.leaves(jax.tree.map(_of_type, otherwise, shape))
         inputs = [*consts, *map(jnp.asarray, jax.tree.leaves(args))]
         params = dict(mapped=(False,) * len(inputs), worlds=None, one_in=one_in, chunk=chunk)
-        out = _where.bind(needed, *rest, *inputs, program=program, rest=len(rest), **params)
+        out = _where.bind(jnp.asarray(needed), *rest, *inputs, program=program, rest=len(rest), **params)
         return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return where
@@ -149,10 +149,8 @@ def _differentiated(
 
     shapes = _inputs(program)
     linear, consts, _ = compiler.trace(changed, shapes, [shapes[i] for i in moving])
-    if all(map(compiler.is_zero, of_otherwise)):
-        kept = []
-    else:
-        kept = [compiler.instantiated(of_otherwise[i]) for i in smooth]
+    still = all(map(compiler.is_zero, of_otherwise))
+    kept = [] if still else [compiler.instantiated(of_otherwise[i]) for i in smooth]
     operands = [*kept, *consts, *inputs, *(changes[i] for i in moving)]
     mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
     found = _where.bind(needed, *operands, program=linear, rest=len(kept), mapped=mapped, **params)

@@ -205,8 +205,8 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
 
     with live_server(request.live, request.json) as live:
         for seed, run in remaining(runs, config.updates, request.seconds).items():
-            total, label = _updates(request, config), f"seed {seed}" if len(runs) > 1 else "training"
-            display = train_output.ProgressDisplay(total, label, trainer.episodes, print_line)
+            label = f"seed {seed}" if len(runs) > 1 else "training"
+            display = train_output.ProgressDisplay(_updates(request, config), label, trainer.episodes, print_line)
             on_progress = display.update
             if live:
                 title = what + f", seed {seed}" * (len(runs) > 1)

@@ -40,6 +40,26 @@ def test_derivatives_are_those_of_the_function_where_it_is_needed_and_zero_elsew
                 np.testing.assert_allclose(of_worlds(X, needed), jnp.where(needed, expected, 0), rtol=1e-12)
 
 
+def test_derivatives_elsewhere_are_those_of_the_given_value():
+    """Of one world with a number of Python and of many, forward, backward and twice."""
+    cube = where_needed(lambda x: x**3, one_in=8)
+
+    def chosen(x, needed):
+        return cube(needed, x, otherwise=5 * x**2)
+
+    for derivative in jax.grad, jax.jacfwd:
+        slope = derivative(chosen)
+        assert (slope(2.0, True), slope(2.0, False)) == (12.0, 20.0)
+        for f, here, elsewhere in (slope, 3 * X**2, 10 * X), (derivative(slope), 6 * X, jnp.full(64, 10.0)):
+            found = jax.jit(jax.vmap(f))(X, X > 3)
+            np.testing.assert_allclose(found, jnp.where(X > 3, here, elsewhere), rtol=1e-12)
+
+
+def test_a_given_value_may_be_all_that_is_differentiated():
+    slope = jax.grad(lambda before, needed: where_needed(jnp.sin)(needed, 2.0, otherwise=before**2))
+    np.testing.assert_allclose(jax.vmap(slope)(X, X > 3), jnp.where(X > 3, 0, 2 * X), rtol=1e-12)
+
+
 def test_worlds_with_one_key_get_one_result():
     key = jax.random.key(0)
     found = jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, key)

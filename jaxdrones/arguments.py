@@ -56,24 +56,35 @@ def choice(kind: str, known: Iterable[str]) -> Check:
     return lambda argument, value: checks.check_choice(kind, value, known)
 
 
-def sequence(example: str) -> Check:
-    """Sequence, of which `example` is an entry."""
-    return functools.partial(checks.check_sequence, example=example)
-
-
-def choices(kind: str, known: Iterable[str], example: str) -> Check:
-    """Sequence of known names."""
+def sequence(example: str, each: Check | None = None) -> Check:
+    """Sequence, of which `example` is an entry, and every entry passes the check `each`."""
 
     def check(argument: str, value: Any) -> None:
         for entry in checks.check_sequence(argument, value, example):
-            checks.check_choice(kind, entry, known)
+            if each is not None:
+                each(argument, entry)
 
     return check
 
 
-def function(example: str) -> Check:
-    """Function."""
-    return lambda argument, value: checks.check_function(argument, value, example=example)
+def choices(kind: str, known: Iterable[str], example: str) -> Check:
+    """Sequence of known names."""
+    return sequence(example, choice(kind, known))
+
+
+def function(example: str, arguments: tuple[str, ...] | None = None, name: str = "") -> Range:
+    """Function, of these arguments if they are given; `example` is one."""
+    return Range(functools.partial(checks.check_function, arguments=arguments, example=example), name)
+
+
+def shape(*lengths: int | str, meaning: str, name: str = "", finite: bool = False) -> Range:
+    """Array of this shape, with finite numbers if asked for; a string is any length of at least one."""
+    return Range(functools.partial(checks.check_shape, shape=lengths, meaning=meaning, finite=finite), name)
+
+
+def quaternion(name: str = "") -> Range:
+    """Unit quaternions (..., 4)."""
+    return Range(checks.check_quaternion, name)
 
 
 def _count_if_known(name: str, value: Any) -> None:

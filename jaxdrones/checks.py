@@ -8,7 +8,7 @@ import difflib
 import functools
 import inspect
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -152,9 +152,10 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 
 def check_sequence(name: str, value: Any, example: str) -> tuple:
-    """Validated entries of a sequence."""
-    if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
-        raise UserError(f"{name} is {short_repr(value)}; give a sequence, for example ({example},)")
+    """Validated entries of a sequence; an iterator, which can be read only once, is none."""
+    if isinstance(value, str | Iterator) or callable(value) or not isinstance(value, Iterable):
+        what = "a single function, " * callable(value) + short_repr(value)
+        raise UserError(f"{name} is {what}; give a sequence, for example ({example},)")
     return tuple(value)
 
 
@@ -195,19 +196,16 @@ def bind(function: Callable, **values: Any) -> Callable:
     return functools.partial(function, **bound) if bound else function
 
 
-def with_scene(function: Callable, scene: Any) -> Callable:
-    """Bind the parameter `scene` of a function, if it has one."""
-    return bind(function, scene=scene)
-
-
-def check_arrays(name: str, tree: Any) -> None:
-    """Raise unless every field but `aux` is an array or a number.
+def check_arrays(**trees: Any) -> None:
+    """Raise unless every field but `aux` of these objects by name is an array or a number.
 
     JAX takes lists, tuples and `None` apart, not as one array.
     """
-    for field, leaf in vars(tree).items():
-        if field != "aux" and isinstance(leaf, _NO_ARRAYS):
-            raise UserError(f"{name}.{field} is {short_repr(leaf)}; give an array, for example jax.numpy.array(...)")
+    for name, tree in trees.items():
+        for field, leaf in vars(tree).items():
+            if field != "aux" and isinstance(leaf, _NO_ARRAYS):
+                remedy = "give an array, for example jax.numpy.array(...)"
+                raise UserError(f"{name}.{field} is {short_repr(leaf)}; {remedy}")
 
 
 def check_params(params: Any, finite: bool = True) -> None:
@@ -218,7 +216,7 @@ def check_params(params: Any, finite: bool = True) -> None:
         finite: whether to check all of them, not only those that must be positive.
     """
     constants = vars(params)
-    check_arrays("params", params)
+    check_arrays(params=params)
     if finite:
         check_finite(
             "params", params.replace(**{name: _without_infinity(constants[name]) for name in _MAY_BE_INFINITE})

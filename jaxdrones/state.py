@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
+from jaxdrones.arguments import checked, shape
 from jaxdrones.checks import check_shape
 from jaxdrones.pytree import PyTreeNode
+
+_ROWS = shape("n", 3, meaning="one row (x, y, z) per drone, at least one drone", finite=True)
 
 
 class State(PyTreeNode):
@@ -30,7 +33,8 @@ class State(PyTreeNode):
     """Continuous states of models by the model's name: pytrees of arrays, from `Step.init`."""
 
     @classmethod
-    def at_rest(cls, pos: ArrayLike, yaw: ArrayLike | None = None) -> State:
+    @checked
+    def at_rest(cls, pos: Annotated[ArrayLike, _ROWS], yaw: ArrayLike | None = None) -> State:
         """Level team at rest with stopped rotors.
 
         Args:
@@ -41,7 +45,6 @@ class State(PyTreeNode):
             ValueError: a wrong shape, no drone, or a number that is not finite.
         """
         pos = jnp.asarray(pos, float)
-        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone, at least one drone", finite=True)
         n = len(pos)
         yaw = jnp.zeros(n) if yaw is None else jnp.asarray(yaw, float)
         check_shape("yaw", yaw, (n,), "one heading per drone", finite=True)

@@ -1,11 +1,12 @@
 """Velocity input of the paper (equation 8): direction and fraction of a speed limit, tracked by the PID."""
 
+from typing import Annotated
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import checked
-from jaxdrones.checks import check_shape
+from jaxdrones.arguments import checked, shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import OneParams, OneState
@@ -13,11 +14,18 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 
 SPEED_SHARE = 0.03  # speed at magnitude 1 over the vehicle's highest speed
+_OF_ONE = shape(4, meaning="direction and magnitude of one drone; use jax.vmap for a team")
 
 
 @checked
 def control(
-    gains: pid.Gains, params: OneParams, memory: pid.Memory, state: OneState, action: Float[Array, "4"], *, dt: float
+    gains: pid.Gains,
+    params: OneParams,
+    memory: pid.Memory,
+    state: OneState,
+    action: Annotated[Float[Array, "4"], _OF_ONE],
+    *,
+    dt: float,
 ) -> tuple[pid.Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone by the PID, RPM; see `jaxdrones.control`.
 
@@ -25,7 +33,6 @@ def control(
     ignored. The position target is the position of the drone and the yaw target its heading, so only the velocity error
     acts.
     """
-    check_shape("action", action, (4,), "direction and magnitude of one drone; use jax.vmap for a team")
     return pid.control(gains, params, memory, state, setpoint(params, state, action), dt=dt)
 
 

@@ -23,8 +23,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Count, Switch, checked, number
-from jaxdrones.checks import check_shape, is_concrete
+from jaxdrones.arguments import Count, Switch, checked, number, shape
+from jaxdrones.checks import is_concrete
 from jaxdrones.dynamics.model import Model, PointMass, constants
 from jaxdrones.dynamics.needs import Needs, declare
 from jaxdrones.errors import UserError
@@ -37,6 +37,8 @@ LARGEST_STEP = 1 / 100
 """Longest physics step with which the cables of `with_payload` are stable, s."""
 _GRAVITY = 9.8  # m/s^2, of the stretch at rest
 _EXAMPLE = "..., from params = jaxdrones.with_payload(params, mass=0.008)"
+_FROM_CENTER = "x, y, z from the center of mass, m, body"
+_ANCHOR = shape(3, meaning=_FROM_CENTER, name="anchor of the cable", finite=True)
 
 
 class Payload(PyTreeNode):
@@ -64,7 +66,7 @@ def with_payload(
     *,
     stretch: Annotated[float, number("of its length", "stretch of the cable", above=0, at_most=0.5)] = 0.01,
     damping_ratio: Annotated[float, number("of the critical damping", "damping of the cable", at_least=0)] = 0.3,
-    anchor: Array | Sequence[float] = (0.0, 0.0, 0.0),
+    anchor: Annotated[Array | Sequence[float], _ANCHOR] = (0.0, 0.0, 0.0),
     cables: Count = 1,
 ) -> Params:
     """Parameters of a drone or a team with the constants of a load in `aux["payload"]`.
@@ -84,7 +86,6 @@ def with_payload(
     Raises:
         ValueError: a number out of range, or a cable so stiff that a physics step of 1/100 s would be unstable.
     """
-    check_shape("anchor of the cable", anchor, (3,), "x, y, z from the center of mass, m, body", finite=True)
     dtype = jnp.result_type(params.mass)
     mass, length, anchor = (jnp.asarray(x, dtype) for x in (mass, length, anchor))
     share = mass / cables

@@ -9,8 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import check_shape, is_concrete, short_repr
+from jaxdrones.arguments import checked, choice, number, shape
+from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.dynamics.model import constants
 from jaxdrones.dynamics.power import battery_voltage
 from jaxdrones.dynamics.rotors import lagging_rotors
@@ -45,8 +45,13 @@ class Motors(PyTreeNode):
         return voltage_for(self.coefficients, thrust)
 
 
+_CUBIC = shape(
+    4, meaning="those of the powers 0 to 3 of the voltage", name="coefficients of the thrust curve", finite=True
+)
+
+
 @checked
-def cubic_motors(coefficients: ArrayLike, supply: Supply = 3.7) -> Motors:
+def cubic_motors(coefficients: Annotated[ArrayLike, _CUBIC], supply: Supply = 3.7) -> Motors:
     """Motors with a cubic thrust curve.
 
     Args:
@@ -57,8 +62,6 @@ def cubic_motors(coefficients: ArrayLike, supply: Supply = 3.7) -> Motors:
         ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply
             voltage that is not positive.
     """
-    meaning = "those of the powers 0 to 3 of the voltage"
-    check_shape("coefficients of the thrust curve", coefficients, (4,), meaning, finite=True)
     if is_concrete(coefficients):
         _, b, c, d = np.asarray(coefficients, float)
         if not (d > 0 and c * c < 3 * b * d):

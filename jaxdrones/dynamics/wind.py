@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked, number
+from jaxdrones.arguments import checked, function, number
 from jaxdrones.checks import check_function, check_number
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
@@ -28,7 +28,8 @@ def clock() -> Model:
     )
 
 
-def in_wind(field: WindField, effect: Effect) -> Effect:
+@checked
+def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag", ("params", "state"))]) -> Effect:
     """Wrap an effect in a wind field, which is added to `params.wind` at the position of the drone.
 
     Args:
@@ -41,7 +42,6 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
     """
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_function("field", field, arguments, example="jaxdrones.logarithmic_wind(5.0)")
-    check_function("effect", effect, ("params", "state"), example="jaxdrones.drag")
 
     @functools.wraps(effect)
     def blown(params: Params, state: State, **scene: Any) -> Wrench:

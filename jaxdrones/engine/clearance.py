@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdrones.accelerate.stored import stored
 from jaxdrones.accelerate.where_needed import in_all_worlds, where_needed
-from jaxdrones.checks import with_scene
+from jaxdrones.checks import bind
 from jaxdrones.dynamics.contact import contact_radius, rim, stop_at
 from jaxdrones.engine.physics import Contact
 from jaxdrones.params import Params
@@ -94,7 +94,7 @@ class NearObstacles:
         """Wrench of the obstacles on every drone of a team."""
 
         def on_all(params: Params, state: State, scene: Scene) -> Wrench:
-            first, *others = (jax.vmap(with_scene(f, scene))(params, state) for f in self._contacts)
+            first, *others = (jax.vmap(bind(f, scene=scene))(params, state) for f in self._contacts)
             return sum(others, first)
 
         still = jax.lax.stop_gradient((params, state))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, limited
 from jaxdrones.engine.clearance import NearObstacles
 from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.physics import Contact, Physics, Rotors, check_functions
+from jaxdrones.engine.physics import Contact, Physics, Rotors, of_step
 from jaxdrones.engine.step import Step, is_traced
 from jaxdrones.engine.team import check_team
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
@@ -90,7 +91,7 @@ def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
-    integrator: Integrator = semi_implicit_euler,
+    integrator: Annotated[Integrator, of_step] = semi_implicit_euler,
     dt: Seconds = 1 / 240,
     substeps: Count = 1,
     *,
@@ -128,7 +129,6 @@ def make_step(
             contact, 1/100 s for `cable`.
     """
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
-    check_functions("integrator", [integrator])
     _check_stable(physics, dt, substeps)
     return ExplicitStep(physics, integrator, dt, substeps, scene)
 
@@ -156,9 +156,13 @@ class ExplicitStep(Step):
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)
 
-        def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
+        def commanded(params: Params, state: State, rpm: ArrayLike) -> jax.Array:
             command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
             check_team(params, state, command)
+            return command
+
+        def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
+            command = commanded(params, state, rpm)
             state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
             near = NearObstacles(physics.contacts("obstacles"), state, scene) if physics.touches(scene) else None
 
@@ -176,8 +180,7 @@ class ExplicitStep(Step):
             return jax.lax.scan(lambda state, _: (substep(state, command), None), state, length=substeps)[0]
 
         def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            command = jnp.asarray(rpm, state.rpm.dtype)
-            check_team(params, state, command)
+            command = commanded(params, state, rpm)
             return derivative(params, physics.at_speed(params, state, command), command, scene)
 
         self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)

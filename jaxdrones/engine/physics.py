@@ -6,12 +6,13 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_function, check_sequence, takes, with_scene
+from jaxdrones.arguments import Check, checked, sequence
+from jaxdrones.checks import bind, check_function, takes
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
@@ -28,7 +29,13 @@ Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], F
 Contact = Callable[[Params, State], Wrench]
 """`(params, state)` of a team of n drones -> wrench of obstacles on each."""
 
-_EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
+_EXAMPLE = {
+    "effects": "jaxdrones.drag",
+    "pairs": "jaxdrones.downwash",
+    "team_effects": "a function (params, state) -> Wrench of the team",
+    "rotors": "jaxdrones.instant_rotors",
+    "integrator": "jaxdrones.rk4",
+}
 _ARGUMENTS = {
     "effects": ("params", "state"),
     "pairs": ("params", "state", "other", "other_state"),
@@ -52,29 +59,50 @@ class Loads(NamedTuple):
     aux_rate: dict[str, Any]
 
 
+def of_step(name: str, function: Any) -> None:
+    """Raise unless this is a function for the argument `name` of `make_step`."""
+    given = bind(function, scene=None) if name == "effects" else function
+    check_function(name, given, _ARGUMENTS[name], example=_EXAMPLE[name], hint=_ELSEWHERE.get(name, ""))
+    if needs_of(function).contact == "obstacles" and not takes(function, "scene"):
+        raise UserError(
+            f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
+            "effect without it"
+        )
+    if contact := _undeclared_contact(function):
+        called, wrapped = describe([function]), describe([contact])
+        raise UserError(
+            f"{name}: {called} calls {wrapped} and does not declare it, so fast drones and long steps would pass "
+            f"unseen; give functools.wraps({wrapped})({called})"
+        )
+
+
+def _functions(name: str) -> Check:
+    return sequence(_EXAMPLE[name], of_step)
+
+
+def _model(name: str, model: Any) -> None:
+    if not isinstance(model, Model):
+        raise UserError(f"{name}: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
+
+
+@checked
 @dataclasses.dataclass(frozen=True)
 class Physics:
     """Effects, models and rotors of a team, shared by both `make_step`."""
 
-    effects: Sequence[Effect] = ()
-    pairs: Sequence[Pair] = ()
-    team_effects: Sequence[TeamEffect] = ()
-    models: Sequence[Model] = ()
-    rotors: Rotors = instant_rotors
+    effects: Annotated[Sequence[Effect], _functions("effects")] = ()
+    pairs: Annotated[Sequence[Pair], _functions("pairs")] = ()
+    team_effects: Annotated[Sequence[TeamEffect], _functions("team_effects")] = ()
+    models: Annotated[Sequence[Model], sequence("jaxdrones.Model(name, init, rate)", _model)] = ()
+    rotors: Annotated[Rotors, of_step] = instant_rotors
     neighbors: NeighborGrid | None = None
 
     def __post_init__(self):
-        check_functions("rotors", [self.rotors])
-        for name in "effects", "pairs", "team_effects":
-            object.__setattr__(self, name, check_functions(name, getattr(self, name)))
-        models = check_sequence("models", self.models, "jaxdrones.Model(name, init, rate)")
-        for model in models:
-            if not isinstance(model, Model):
-                raise UserError(f"models: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
-        names = [model.name for model in models]
+        for name in "effects", "pairs", "team_effects", "models":
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        names = [model.name for model in self.models]
         if len(set(names)) < len(names):
             raise UserError(f"models are named {', '.join(names)}; give each a name of its own")
-        object.__setattr__(self, "models", models)
         if not (self.neighbors is None or isinstance(self.neighbors, NeighborGrid)):
             raise UserError(
                 f"neighbors is {self.neighbors!r}; give for example jaxdrones.NeighborGrid(cutoff=3.0), or leave it out"
@@ -148,41 +176,18 @@ class Physics:
         effects = [effect for effect in self.effects if effect not in contacts]
 
         def alone(params: Params, state: State) -> Wrench:
-            own = (check_wrench("effects", f, with_scene(f, scene)(params, state)) for f in effects)
+            own = (check_wrench("effects", f, bind(f, scene=scene)(params, state)) for f in effects)
             return sum(own, rotor_wrench(params, state))
 
         wrench = jax.vmap(alone)(params, state)
         if contact is not None:
             wrench += contact(params, state)
         elif scene.has_obstacles:
-            wrench = sum((jax.vmap(with_scene(f, scene))(params, state) for f in contacts), wrench)
+            wrench = sum((jax.vmap(bind(f, scene=scene))(params, state) for f in contacts), wrench)
         of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
         wrench = sum(of_team, wrench)
         state = side_by_side(state) if self.contacts("drones") else state
         return sum((from_others(pair, params, state, self.neighbors) for pair in self.pairs), wrench)
-
-
-def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
-    """Validated functions of an argument of `make_step`."""
-    example = f"jaxdrones.{_EXAMPLE[name]}" if name in _EXAMPLE else "a function (params, state) -> Wrench of the team"
-    if callable(functions):
-        raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
-    functions = check_sequence(name, functions, example)
-    for function in functions:
-        given = with_scene(function, None) if name == "effects" else function
-        check_function(name, given, _ARGUMENTS[name], example=example, hint=_ELSEWHERE.get(name, ""))
-        if needs_of(function).contact == "obstacles" and not takes(function, "scene"):
-            raise UserError(
-                f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
-                "effect without it"
-            )
-        if contact := _undeclared_contact(function):
-            called, wrapped = describe([function]), describe([contact])
-            raise UserError(
-                f"{name}: {called} calls {wrapped} and does not declare it, so fast drones and long steps would pass "
-                f"unseen; give functools.wraps({wrapped})({called})"
-            )
-    return functions
 
 
 def _undeclared_contact(function: Callable) -> Callable | None:

@@ -32,8 +32,7 @@ _CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !
 
 def check_team(params: Params, state: State, rpm: Any) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
-    check_arrays("state", state)
-    check_arrays("params", params)
+    check_arrays(state=state, params=params)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
     drones, team = f"state.pos has {n} drones", "make a team with jaxdrones.repeat or jaxdrones.stack"
@@ -61,7 +60,7 @@ def _check_aux(name: str, aux: Any, n: int) -> None:
 
 def check_state(state: State) -> None:
     """Raise `ValueError` for concrete states that cannot fly."""
-    check_arrays("state", state)
+    check_arrays(state=state)
     check_finite("state", state)
     check_quaternion("state.quat", state.quat)
 

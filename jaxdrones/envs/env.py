@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.checks import check_key, check_shape
+from jaxdrones.arguments import Key, checked
+from jaxdrones.checks import check_shape
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
@@ -183,9 +184,9 @@ class Env:
             world = self.with_images("first", key, world)
         return observation(obs, world), world
 
-    def begin(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
+    @checked
+    def begin(self, key: Key, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
         """`reset` without images."""
-        check_key("key", key)
         world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)
         return self.compiled(episode.first_observation)(key, world, rate)
@@ -197,8 +198,9 @@ class Env:
         noise = jax.random.fold_in(key, episode.VISION) if self.vision.camera.noise else None
         return (look if self.vision.on_host else self._program(method, look))(noise, world, *args)
 
+    @checked
     def step(
-        self, key: jax.Array, world: World, action: Float[ArrayLike, "n a"]
+        self, key: Key, world: World, action: Float[ArrayLike, "n a"]
     ) -> tuple[Obs, World, Float[Array, " n"], Array, Array, dict[str, Any]]:
         """One control step.
 
@@ -216,7 +218,6 @@ class Env:
         Raises:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).
         """
-        check_key("key", key)
         shape = self.drones, self.action_size
         check_shape("action", action, shape, "one row of the action type's size per drone", finite=True)
         # A program without random keys can be a single kernel.

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import NOT_NEGATIVE, POSITIVE, check_function, check_number, is_concrete, short_repr
+from jaxdrones.checks import NOT_NEGATIVE, POSITIVE, check_number, is_concrete, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -117,8 +117,6 @@ def all_randomizations(
 ) -> tuple[Randomization, ...]:
     """All randomizations of an environment, whole vehicles first."""
     preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
-    for function in given:
-        check_function("randomize", function, example="scaled('mass', 0.9, 1.1)")
     chosen = [*preset, *task, *given]
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]

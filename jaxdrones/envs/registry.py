@@ -49,6 +49,7 @@ from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
 BACKENDS = ("explicit", "bullet")
+_SCALED = "scaled('mass', 0.9, 1.1)"
 
 
 @checked
@@ -70,7 +71,7 @@ def make(
     integrator: str = "semi_implicit_euler",
     control_hz: Hertz | None = None,
     substeps: Count | None = None,
-    randomize: Annotated[Sequence[Randomization] | None, sequence("scaled('mass', 0.9, 1.1)")] = None,
+    randomize: Annotated[Sequence[Randomization] | None, sequence(_SCALED, function(_SCALED))] = None,
     noise: Annotated[Noise | None, function("sensor_noise()")] = None,
     disturbance: Annotated[Disturbance | None, function("random_pushes(0.3)")] = None,
     delay: float | tuple[float, float] | None = None,

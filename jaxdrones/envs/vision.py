@@ -18,7 +18,7 @@ from jaxdrones.envs.functions import DrawScene
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene, render
-from jaxdrones.sensing.camera import check_camera
+from jaxdrones.sensing.camera import OneCamera
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World
 
@@ -131,7 +131,7 @@ def observation(vector: Float[Array, "n d"], world: World) -> Any:
 def make_vision(
     step: Step,
     images: Annotated[Sequence[str], choices("image", IMAGES, "'depth'")],
-    camera: Annotated[Camera, check_camera],
+    camera: OneCamera,
     dt: float,
     scene: Scene | DrawScene,
 ) -> Vision:

@@ -5,6 +5,8 @@ Random scenes have the same array shapes for every key, so one compiled program 
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.arguments import Key, checked
-from jaxdrones.checks import check_key, check_number, check_shape
+from jaxdrones.arguments import Key, checked, shape
+from jaxdrones.checks import check_number
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
@@ -84,10 +86,11 @@ def forest(
     )
 
 
+@checked
 def room(
     size: tuple[float, float, float] = (8.0, 8.0, 3.0),
     *,
-    key: jax.Array | None = None,
+    key: Key | None = None,
     pillars: int = 0,
     spheres: int = 0,
     boxes: int = 0,
@@ -115,7 +118,6 @@ def room(
         return Scene.of(shell)
     if key is None:
         raise UserError("a room with pillars or clutter is drawn from a key; give key=jax.random.key(0)")
-    check_key("key", key)
     pillar_key, sphere_key, box_key = jax.random.split(key, 3)
     free, corners = _points(keep_free), jnp.array([[-x / 2, -y / 2, 0], [x / 2, y / 2, z]])
     inside = (
@@ -126,18 +128,29 @@ def room(
     return Scene.of(shell, *(solids.replace(active=_is_free(solids, free, clearance)) for solids in inside))
 
 
-def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
+_POSES = shape("k", 4, meaning="x, y, z (m) and heading (rad) of every gate", name="gates of a track")
+_CENTER = shape(3, meaning="one gate; for many use jax.vmap", name="pos of a gate")
+
+
+@checked
+def track(gates: Annotated[ArrayLike, _POSES], opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
     """Gates at given poses, four boxes each, in the order of the poses.
 
     A pose is x, y, z of the center of the opening (m) and the heading in which it is crossed (rad); other arguments are
     those of `gate`.
     """
     gates = jnp.asarray(gates, float)
-    check_shape("gates of a track", gates, ("k", 4), "x, y, z (m) and heading (rad) of every gate")
     return Scene.of(jax.vmap(lambda pose: gate(pose[:3], pose[3], opening, frame, depth))(gates))
 
 
-def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Box:
+@checked
+def gate(
+    pos: Annotated[ArrayLike, _CENTER],
+    yaw: ArrayLike = 0.0,
+    opening: float = 0.4,
+    frame: float = 0.16,
+    depth: float = 0.05,
+) -> Box:
     """The four beams of a gate: a square opening in a square frame.
 
     The default size is that of the gates of lsy_drone_racing: 0.4 m inside, 0.72 m outside. For many gates use
@@ -151,7 +164,6 @@ def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: floa
         depth: of the beams along the heading, m.
     """
     pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
-    check_shape("pos of a gate", pos, (3,), "one gate; for many use jax.vmap")
     outer, offset = opening + 2 * frame, (opening + frame) / 2
     sin, cos = sin_cos(yaw)
     half_sin, half_cos = sin_cos(yaw / 2)

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, number
-from jaxdrones.checks import check_number, check_quaternion, check_whole, short_repr
+from jaxdrones.arguments import checked, number, quaternion
+from jaxdrones.checks import check_number, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -41,7 +41,7 @@ class Camera:
     offset: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     """(3,) position of the eye relative to the center of mass, m, body axes; world axes if the camera is levelled.
     `None`: one arm of the drone above the center of mass."""
-    orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    orientation: Annotated[tuple[float, ...], quaternion("{argument} of a camera")] = (0.0, 0.0, 0.0, 1.0)
     """(4,) unit quaternion (x, y, z, w), camera to body."""
     levelled: bool = False
     """Whether the camera points along the body's x axis with the world's z axis up in the image, whatever the roll."""
@@ -72,7 +72,6 @@ class Camera:
                 if np.shape(value) != (length,):
                     raise UserError(f"{name} of a camera is {short_repr(value)}; give {length} numbers")
                 object.__setattr__(self, name, tuple(map(float, value)))
-        check_quaternion("orientation of a camera", self.orientation)
         length = math.hypot(*self.orientation)
         object.__setattr__(self, "orientation", tuple(x / length for x in self.orientation))
 
@@ -162,7 +161,9 @@ camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), off
 corners of the pixels in place of their centers."""
 
 
-def check_camera(name: str, camera: Any) -> None:
-    """Raise unless `camera` is a camera."""
+def _camera(name: str, camera: Any) -> None:
     if not isinstance(camera, Camera):
         raise UserError(f"{name} is {short_repr(camera)}; give for example jaxdrones.Camera(resolution=(16, 12))")
+
+
+OneCamera = Annotated[Camera, _camera]

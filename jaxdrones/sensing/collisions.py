@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_shape
+from jaxdrones.arguments import checked, number
+from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.distances import fold_near, merged
 from jaxdrones.sensing.geometry import around_z, length
-from jaxdrones.sensing.scene import Scene, check_scene
+from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.shapes import Cylinder, Obstacle
 from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt, unit
@@ -35,7 +38,13 @@ class Collisions(PyTreeNode):
     """(n,) bool: an obstacle."""
 
 
-def collisions(params: Params, state: State, scene: Scene = _BARE, margin: ArrayLike = _MARGIN) -> Collisions:
+@checked
+def collisions(
+    params: Params,
+    state: State,
+    scene: AnalyticScene = _BARE,
+    margin: Annotated[ArrayLike, number("m", at_least=0)] = _MARGIN,
+) -> Collisions:
     """Compute which drones of a team touch the ground, another drone or an obstacle.
 
     A drone is its collision cylinder. The contact `balls` of both backends lie inside it; they reach its faces and rim,
@@ -57,8 +66,6 @@ def collisions(params: Params, state: State, scene: Scene = _BARE, margin: Array
     hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
     for name in "collision_radius", "collision_height", "collision_offset":
         check_shape(f"params.{name}", getattr(params, name), (n,), hint)
-    check_scene(scene)
-    check_number("margin", margin, "m", at_least=0)
     bodies = _bodies(params, state)
     touched = jnp.zeros(n, bool)
     for obstacles in merged(scene.shapes(bodies.pos.dtype)):

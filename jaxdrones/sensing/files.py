@@ -10,10 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, number
-from jaxdrones.checks import check_quaternion, check_shape
+from jaxdrones.arguments import Range, checked, number, quaternion, shape
 from jaxdrones.errors import UserError
-from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
+from jaxdrones.sensing.shapes import GREY, Box
+
+_NAME = "{argument} of {function}"
+
+
+def _numbers(length: int) -> Range:
+    return shape(length, meaning="of one body", name=_NAME, finite=True)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -21,19 +26,16 @@ class File:
     """Static solid from a file; its numbers are concrete, as Bullet reads them once."""
 
     path: str | Path
-    pos: tuple[float, ...]
+    pos: Annotated[tuple[float, ...], _numbers(3)]
     """(3,) m, world."""
-    quat: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    quat: Annotated[tuple[float, ...], _numbers(4), quaternion(_NAME)] = (0.0, 0.0, 0.0, 1.0)
     """(4,) attitude, unit quaternion (x, y, z, w), obstacle to world."""
-    color: tuple[float, ...] = GREY
+    color: Annotated[tuple[float, ...], _numbers(4)] = GREY
     """(4,) red, green, blue, opacity, each 0 to 1."""
 
     def __post_init__(self):
         for name in "pos", "quat", "color":
-            value = np.asarray(getattr(self, name), float)
-            check_shape(f"{name} of {type(self).__name__}", value, (LENGTHS[name],), "of one body", finite=True)
-            object.__setattr__(self, name, tuple(value.tolist()))
-        check_quaternion(f"quat of {type(self).__name__}", self.quat)
+            object.__setattr__(self, name, tuple(np.asarray(getattr(self, name), float).tolist()))
         if not Path(self.path).is_file():
             raise UserError(f"{self.path}: there is no such file; give the path of a mesh or URDF that exists")
 
@@ -43,7 +45,7 @@ class File:
 class Mesh(File):
     """Triangle mesh (.obj, .stl, .dae); Bullet collides with its convex hull."""
 
-    scale: Annotated[float, number("m", "scale of Mesh", above=0)] = 1.0
+    scale: Annotated[float, number("m", _NAME, above=0)] = 1.0
     """Length of the file's unit, m."""
 
     def bounding_box(self) -> Box:
@@ -59,6 +61,7 @@ class Mesh(File):
         return Box(pos=tuple(pos.tolist()), quat=self.quat, size=tuple(size.tolist()), color=self.color)
 
 
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Urdf(File):
     """Body from a URDF, with its own colors."""

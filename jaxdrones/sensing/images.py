@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked, shape
 from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.sensing.camera import Camera, check_camera
+from jaxdrones.sensing.camera import Camera, OneCamera
 from jaxdrones.sensing.frustum import Ground, View
-from jaxdrones.sensing.scene import Scene, check_scene
+from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
 from jaxdrones.sensing.visibility import depth, visible
@@ -43,9 +44,11 @@ class Images(PyTreeNode):
 
 
 _DEFAULT = Camera()
+_Point = Annotated[ArrayLike, shape(3, meaning="m, world")]
 
 
-def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT) -> Images:
+@checked
+def render(scene: AnalyticScene, params: Params, state: State, camera: OneCamera = _DEFAULT) -> Images:
     """Render the camera of every drone of a team.
 
     One ray a pixel is intersected with boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four
@@ -62,13 +65,11 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
     Raises:
         ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
     """
-    _check(scene, params, state, camera)
+    _check_team(params, state)
     return _render(scene, params, state, camera)
 
 
-def _check(scene: Scene, params: Params, state: State, camera: Camera) -> None:
-    check_camera("camera", camera)
-    check_scene(scene)
+def _check_team(params: Params, state: State) -> None:
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")
 
@@ -85,13 +86,14 @@ def photograph(
     return view(scene, params, state, eye, target, camera).rgb[..., :3]
 
 
+@checked
 def view(
-    scene: Scene,
+    scene: AnalyticScene,
     params: Params,
     state: State,
-    eye: ArrayLike,
-    target: ArrayLike,
-    camera: Camera = _DEFAULT,
+    eye: _Point,
+    target: _Point,
+    camera: OneCamera = _DEFAULT,
     colors: Float[ArrayLike, "n 3"] | None = None,
 ) -> Images:
     """Upright images of a team from a fixed point in the world, without an axis over drones.
@@ -100,9 +102,7 @@ def view(
     mounting is ignored. The colors are red, green and blue of every drone, 0 to 1; rear rotors are lighter. By default
     all drones look alike. Other arguments and errors are those of `render`.
     """
-    _check(scene, params, state, camera)
-    for name, point in ("eye", eye), ("target", target):
-        check_shape(name, point, (3,), "m, world")
+    _check_team(params, state)
     eye, target = (jnp.asarray(x, state.pos.dtype) for x in (eye, target))
     forward = unit(target - eye)
     left = unit(cross(along_z(jnp.ones_like(eye[0])), forward))

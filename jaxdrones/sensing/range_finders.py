@@ -16,14 +16,13 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, number, whole
-from jaxdrones.checks import check_quaternion, check_shape
+from jaxdrones.arguments import checked, number, quaternion, shape, whole
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.distances import as_floats
 from jaxdrones.sensing.geometry import Number
-from jaxdrones.sensing.scene import Scene, check_scene
+from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.state import State
@@ -35,7 +34,11 @@ _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _NEAREST_FLOW = 0.08  # m: the PMW3901 is out of focus below
 
 
-def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, ""]:
+_Vector = Annotated[ArrayLike, shape(3, meaning="x, y, z of one ray; for many use jax.vmap")]
+
+
+@checked
+def ray(scene: AnalyticScene, origin: _Vector, direction: _Vector) -> Float[Array, ""]:
     """Distance along a ray to the first surface of a scene, m; zero where it starts inside.
 
     It is differentiable in the ray and in the scene.
@@ -51,10 +54,7 @@ def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, "
     Raises:
         ValueError: a wrong shape, or a mesh or URDF file in the scene.
     """
-    check_scene(scene)
     origin, direction = as_floats(origin), as_floats(direction)
-    for name, value in ("origin", origin), ("direction", direction):
-        check_shape(name, value, (3,), "x, y, z of one ray; for many use jax.vmap")
     hits = [jnp.full((), jnp.inf, origin.dtype)]
     if scene.ground:
         hits.append(_to_ground(origin, direction))
@@ -86,7 +86,7 @@ def range_finder(
     noise: Annotated[float, number("m", "{argument} of a range finder", at_least=0)] = 0.0,
     dropout: Annotated[float, number("a share", "{argument} of a range finder", at_least=0, at_most=1)] = 0.0,
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    orientation: tuple[float, float, float, float] = _IDENTITY,
+    orientation: Annotated[tuple[float, ...], quaternion("{argument} of a range finder")] = _IDENTITY,
 ) -> Sensor:
     """Range finder with one or more beams; its reading (...) are the ranges, m, at most `max_range`.
 
@@ -109,7 +109,6 @@ def range_finder(
     lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise UserError("a direction of a range finder has no length or is not finite; give vectors along the beams")
-    check_quaternion("orientation of a range finder", orientation)
     directions = directions / lengths
     quat = np.asarray(orientation, float) / np.linalg.norm(orientation)
 

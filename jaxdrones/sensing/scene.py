@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
@@ -119,24 +120,24 @@ class Scene(PyTreeNode, kw_only=True):
 
         Where obstacles overlap, the deepest one counts. It is infinity in an empty scene.
         """
-        point = self._point(point)
-        return distance_of(self.shapes(point.dtype), self.ground, point)
+        shapes, point = self._at(point)
+        return distance_of(shapes, self.ground, point)
 
     def nearest(self, point: ArrayLike) -> Surface:
         """Nearest surface: signed distance, nearest point and outward normal, also from inside.
 
         Ties are broken arbitrarily.
         """
-        point = self._point(point)
-        return nearest_of(self.shapes(point.dtype), self.ground, point)
+        shapes, point = self._at(point)
+        return nearest_of(shapes, self.ground, point)
 
     def nearest_few(self, point: ArrayLike, count: int) -> Surface:
         """Nearest surfaces of each of the `count` nearest obstacles, the ground among them; the nearest first.
 
         They have a leading axis of length `count`; see `Surface` for those beyond the number of obstacles.
         """
-        point = self._point(point)
-        return nearest_few_of(self.shapes(point.dtype), self.ground, point, count)
+        shapes, point = self._at(point)
+        return nearest_few_of(shapes, self.ground, point, count)
 
     def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
         """Nearest obstacle surface for each of several points of one body, near each other.
@@ -144,10 +145,10 @@ class Scene(PyTreeNode, kw_only=True):
         Faster than `nearest`: only obstacles within reach of the body are considered. Where no obstacle is nearer than
         `within` (m) to a point, the surface is that of an arbitrary obstacle.
         """
-        check_scene(self)
-        if not self.has_obstacles:
+        shapes = self._analytic(points.dtype)
+        if not shapes:
             raise UserError("the scene has no obstacles that could be touched; check scene.has_obstacles first")
-        (obstacles,) = merged(self.shapes(points.dtype))
+        (obstacles,) = merged(shapes)
         return touched_of(obstacles, points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
@@ -179,19 +180,21 @@ class Scene(PyTreeNode, kw_only=True):
             arrays[name] = _joined([rest] if stack is None else [stack, rest])
         return self.replace(**arrays)
 
-    def _point(self, point: ArrayLike) -> Array:
-        check_scene(self)
+    def _analytic(self, dtype: DTypeLike) -> list[Obstacle]:
+        check_scene("scene", self)
+        return self.shapes(dtype)
+
+    def _at(self, point: ArrayLike) -> tuple[list[Obstacle], Array]:
         point = as_floats(point)
         check_shape("point", point, (3,), "x, y, z of one point; for many use jax.vmap")
-        return point
+        return self._analytic(point.dtype), point
 
 
-def check_scene(scene: Any, files: bool = False) -> None:
+def check_scene(name: str, scene: Any, files: bool = False) -> None:
     """Raise unless `scene` is the scene of one world; meshes and URDF files need `files`."""
     if not isinstance(scene, Scene):
-        raise UserError(
-            f"scene is {short_repr(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
-        )
+        given = f"{name} is {short_repr(scene)}"
+        raise UserError(f"{given}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)")
     for name in KINDS:
         stack = getattr(scene, name)
         if stack is not None:
@@ -204,6 +207,12 @@ def check_scene(scene: Any, files: bool = False) -> None:
             f"the scene has a {type(file).__name__}, supported by Bullet only; give {known}, for example "
             f"{builder} in its place, or use the Bullet backend, for example step.contacts(params, state)"
         )
+
+
+AnyScene = Annotated[Scene, functools.partial(check_scene, files=True)]
+"""Scene of one world."""
+AnalyticScene = Annotated[Scene, check_scene]
+"""Scene of one world without meshes and URDF files."""
 
 
 def _as_arrays(obstacles: Obstacle, dtype: DTypeLike) -> Obstacle:

@@ -17,6 +17,7 @@ from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
 
+_ARGUMENTS = {"measure": ("key", "params", "state", "rate", "scene", "memory"), "init": ("key", "params")}
 _ROUNDING = 1e-4  # of a measurement; tolerance for rounding of a rate that divides the control rate
 
 
@@ -63,9 +64,8 @@ class Sensor:
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
             raise UserError(f"name of a sensor is {short_repr(self.name)}; give a text, for example 'imu'")
-        measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
-        check_function(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
-        check_function(begun, self.init, ("key", "params"))
+        for field, arguments in _ARGUMENTS.items():
+            check_function(f"{field} of sensor {self.name!r}", getattr(self, field), arguments)
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
             check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_quaternion, check_shape
+from jaxdrones.arguments import checked, quaternion, shape
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.files import Mesh
 from jaxdrones.sensing.scene import Scene
@@ -23,10 +23,16 @@ Pose = tuple[Any, Any]
 _ORIGIN: Pose = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
+_NAME = "{argument} of the root link"
+_Pos = Annotated[ArrayLike, shape(3, meaning="of one link", name=_NAME, finite=True)]
+_Quat = Annotated[ArrayLike, shape(4, meaning="of one link", name=_NAME, finite=True), quaternion(_NAME)]
+
+
+@checked
 def from_urdf(
     path: str | os.PathLike,
-    pos: ArrayLike = (0.0, 0.0, 0.0),
-    quat: ArrayLike = (0.0, 0.0, 0.0, 1.0),
+    pos: _Pos = (0.0, 0.0, 0.0),
+    quat: _Quat = (0.0, 0.0, 0.0, 1.0),
     ground: bool = True,
 ) -> Scene:
     """Load the boxes, spheres, cylinders and capsules of a URDF as static obstacles.
@@ -46,9 +52,6 @@ def from_urdf(
     file = Path(path)
     if not file.is_file():
         raise UserError(f"{file}: there is no such file; give the path of a URDF that exists")
-    for name, value, length in ("pos", pos, 3), ("quat", quat, 4):
-        check_shape(f"{name} of the root link", value, (length,), "of one link", finite=True)
-    check_quaternion("quat of the root link", quat)
     try:
         robot = ET.parse(file).getroot()
     except ET.ParseError as error:

@@ -18,7 +18,7 @@ from jaxdrones.engine.step import is_traced
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
 from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.scene import check_scene
+from jaxdrones.sensing.scene import AnyScene
 
 
 @checked
@@ -32,7 +32,7 @@ def make_step(
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
     neighbors: NeighborGrid | None = None,
-    scene: Scene | None = None,
+    scene: AnyScene | None = None,
     damping: Annotated[float, number("1/s", at_least=0)] = 0.0,
     collision: Annotated[str, choice("collision shape", (BALLS, CYLINDER))] = BALLS,
     renderer: Annotated[str, choice("renderer", (TINY, EGL))] = TINY,
@@ -63,7 +63,6 @@ def make_step(
             "leave it out"
         )
     scene = Scene() if scene is None else scene
-    check_scene(scene, files=True)
     if is_traced(scene):
         raise UserError(
             "the scene is traced by jit, vmap or grad and has no values yet; make the step outside, of a scene of "

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from jax.typing import ArrayLike
 
 from jaxdrones.accelerate.small import jit_small
+from jaxdrones.arguments import checked
 from jaxdrones.checks import check_finite, check_params
 from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import drone_pictures, photo, views
@@ -23,7 +24,7 @@ from jaxdrones.engine.step import HostStep, is_traced
 from jaxdrones.engine.team import Layout, check_state, check_team, columns, pack
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene
-from jaxdrones.sensing.camera import check_camera
+from jaxdrones.sensing.camera import OneCamera
 from jaxdrones.sensing.scene import check_scene
 from jaxdrones.state import State
 
@@ -101,19 +102,18 @@ class BulletStep(HostStep):
     def contacts(self, params: Params, state: State, scene: Scene | None = None) -> list[Contact]:
         """Contacts in the next physics step, with the rotors held at `state.rpm`."""
         acting = self._set_scene(self._given(scene))
-        team = self._pack(params, state, state.rpm)
-        check_state(state)
+        team = self._place(params, state)
         self.client.advance(team, self._loads_on(team, Layout.of(state.aux), acting))
         return contacts_of_last_step(self.client, self.dt)
 
+    @checked
     def camera(
-        self, params: Params, state: State, camera: Camera = _DEFAULT_CAMERA, scene: Scene | None = None
+        self, params: Params, state: State, camera: OneCamera = _DEFAULT_CAMERA, scene: Scene | None = None
     ) -> Images:
         """Images of the camera of every drone, in the format of `jaxdrones.render`, rendered by Bullet.
 
         A camera inside an obstacle or underground sees it in black at `near`.
         """
-        check_camera("camera", camera)
         scene = self._given(scene)
         if is_traced((params, state, scene)):
             check_team(params, state, state.rpm)
@@ -145,7 +145,7 @@ class BulletStep(HostStep):
         self.client.check_open()
         if scene is None:
             return self._scene
-        check_scene(scene, files=True)
+        check_scene("scene", scene, files=True)
         return scene
 
     def _set_scene(self, scene: Scene) -> Scene:

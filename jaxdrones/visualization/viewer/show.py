@@ -73,7 +73,7 @@ def show(
     worlds = _worlds(flight, of_trajectory)
     records = list(worlds.values())
     if scene is not None:
-        check_scene(scene, files=True)
+        check_scene("scene", scene, files=True)
         records = [dataclasses.replace(record, scene=scene) for record in records]
     if arrows is not None and (len(records) > 1 or np.shape(arrows) != records[0].pos.shape):
         raise UserError(

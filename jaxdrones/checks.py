@@ -8,7 +8,7 @@ import difflib
 import functools
 import inspect
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -135,6 +135,12 @@ def check_choice(kind: str, name: str, known: Iterable[str]) -> None:
     known = sorted(known)
     if name not in known:
         raise UserError(f"unknown {kind} {name!r}{hint(name, known)} (known: {', '.join(known)})")
+
+
+def look_up(kind: str, name: str, table: Mapping[str, Any]) -> Any:
+    """Entry of a table by its name."""
+    check_choice(kind, name, table)
+    return table[name]
 
 
 def check_keyword(function: str, keyword: str, known: Iterable[str]) -> None:

@@ -133,7 +133,7 @@ def stack(team: Sequence[Params]) -> Params:
     """
     check_whole("number of drones", len(team))
     for i, params in enumerate(team):
-        _check_single(f"mass of drone {i}", params, "stack takes the parameters of single drones")
+        check_single(f"mass of drone {i}", params, "stack takes the parameters of single drones")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *team)
 
 
@@ -144,11 +144,12 @@ def repeat(params: Params, n: Annotated[int, whole("number of drones")]) -> Para
     Raises:
         ValueError: `n` < 1, or `params` is already a team or cannot fly.
     """
-    _check_single("mass", params, "repeat takes the parameters of a single drone")
+    check_single("mass", params, "repeat takes the parameters of a single drone")
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), params)
 
 
-def _check_single(name: str, params: Params, meaning: str) -> None:
+def check_single(name: str, params: Params, meaning: str) -> None:
+    """Raise unless these are the parameters of one drone that can fly; `meaning` is for the message."""
     if not isinstance(params, Params):
         raise UserError(f"{short_repr(params)} is given; {meaning}, for example of jaxdrones.load_params")
     check_params(params)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import enum
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxdrones.checks import check_choice, is_concrete
-from jaxdrones.errors import UserError
+from jaxdrones.arguments import choice
 
-ON_FAILURE = ("hold", "raise")
-"""Actions of a planner without a new plan: repeat the last safe command, or raise."""
+OnFailure = Annotated[str, choice("on_failure", ("hold", "raise"))]
+"""Action of a planner without a new plan: repeat the last safe command, or raise."""
 
 
 class Status(enum.IntEnum):
@@ -55,16 +54,6 @@ def is_finite(tree: Any) -> Bool[Array, ""]:
     """Whether all floating-point numbers of a pytree are finite."""
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]))
-
-
-def check_on_failure(on_failure: str, *given: Any) -> None:
-    """Raise unless `on_failure` is in `ON_FAILURE`; `raise` needs concrete arguments of the planner."""
-    check_choice("on_failure", on_failure, ON_FAILURE)
-    if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves(given))):
-        raise UserError(
-            "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
-            "check the status of the memory"
-        )
 
 
 def raise_unless_ok(status: Any, planner: str) -> None:

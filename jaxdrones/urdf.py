@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice, short_repr
+from jaxdrones.checks import look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import AIR_DENSITY, Params
 
@@ -74,8 +74,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
         raise UserError(f"vehicle is {short_repr(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
-        check_choice("vehicle", str(vehicle), assets.vehicles())
-        path = assets.vehicles()[str(vehicle)]
+        path = look_up("vehicle", str(vehicle), assets.vehicles())
     return _params(_Urdf(path))
 
 

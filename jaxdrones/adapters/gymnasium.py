@@ -23,7 +23,7 @@ from jaxdrones.adapters.session import SEEDS, Session, as_env, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.arguments import Count, checked
-from jaxdrones.checks import check_choice, short_repr
+from jaxdrones.checks import look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
@@ -260,8 +260,7 @@ def _layout(env: envs.Env, by_drone: bool) -> Layout:
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     value = mode.value if isinstance(mode, AutoresetMode) else mode
-    check_choice("autoreset_mode", value, [known.value for known in AutoresetMode])
-    return AutoresetMode(value)
+    return look_up("autoreset_mode", value, {known.value: known for known in AutoresetMode})
 
 
 def _refuse(options: dict[str, Any] | None) -> None:

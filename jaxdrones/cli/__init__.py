@@ -23,7 +23,7 @@ from jaxdrones.cli import (
     train,
     view,
 )
-from jaxdrones.cli.common import Parser, lasting_interrupts, print_failure
+from jaxdrones.cli.common import Parser, check_options, lasting_interrupts, print_failure
 from jaxdrones.cli.settings import task_first, with_config
 
 
@@ -34,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))
         debug = options.debug
         machine.keep_programs()
+        check_options(options)
         with lasting_interrupts():
             return options.run(options)
     except BaseException as error:

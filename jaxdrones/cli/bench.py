@@ -12,7 +12,6 @@ from jaxdrones import arguments
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
-from jaxdrones.cli.common import check_options
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
@@ -43,7 +42,7 @@ def add(commands) -> None:
         "--worlds", type=_counts, metavar="N,N", help="numbers of worlds (1024,16384; more on an accelerator)"
     )
     parser.add_argument("--seconds", type=float, default=25.0, metavar="S", help="time limit, s (25)")
-    parser.set_defaults(run=_bench)
+    parser.set_defaults(run=_bench, ranges=dict(seconds=arguments.number("s", above=0), worlds=_check_worlds))
 
 
 def _counts(text: str) -> list[int]:
@@ -60,7 +59,6 @@ def _check_worlds(name: str, worlds: list[int]) -> None:
 
 def _bench(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
-    check_options(options, seconds=arguments.number("s", above=0), worlds=_check_worlds)
     worlds = options.worlds or _WORLDS["cpu" if jax.default_backend() == "cpu" else "other"]
     rows: list[dict[str, Any]] = []
     longest: dict[str, float] = {}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.arguments import number, whole
-from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, folder, print_error, print_warning
+from jaxdrones.cli.common import INTERRUPTED, check_writable, folder, print_error, print_warning
 from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import listed, print_results
@@ -62,7 +62,8 @@ def add(commands) -> None:
     )
     clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until it is armed, s (30)")
     add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
-    parser.set_defaults(run=_run)
+    ranges = dict(duration=number("s", above=0), wait=number("s", above=0), flip=number("s", at_least=0))
+    parser.set_defaults(run=_run, ranges=ranges | dict(physics_hz=whole("rate of the physics (Hz)", limit=_MAX_HZ)))
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -124,9 +125,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    hertz = whole("rate of the physics (Hz)", limit=_MAX_HZ)
-    times = dict(duration=number("s", above=0), wait=number("s", above=0), flip=number("s", at_least=0))
-    check_options(options, physics_hz=hertz, **times)
     if options.policy is not None and options.joystick is not None:
         raise UserError("--policy and --joystick are given; one of them can hold the sticks")
     if options.joystick is not None and options.flip is not None:

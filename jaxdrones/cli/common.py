@@ -13,10 +13,10 @@ from pathlib import Path
 import jax
 
 from jaxdrones import user_code
-from jaxdrones.arguments import Check
 from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.cli import machine
 from jaxdrones.errors import UserError
+from jaxdrones.visualization import plots
 
 DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
 EXIT_CODES = """exit codes:
@@ -141,16 +141,18 @@ def run_folder(task: str, ending: str = "") -> Path:
     return Path("runs") / (task.rpartition(":")[2] + ending)
 
 
-def check_options(options: argparse.Namespace, **ranges: Check) -> None:
-    """Raise unless the options that are given are in these ranges."""
-    for name, check in ranges.items():
+def check_options(options: argparse.Namespace) -> None:
+    """Raise unless the options that are given are in the `ranges` of their command."""
+    for name, check in getattr(options, "ranges", {}).items():
         if getattr(options, name) is not None:
             check(name, getattr(options, name))
 
 
 def check_writable(*files: Path | None) -> None:
-    """Raise unless these files can be written; create their folders."""
+    """Raise unless these files can be written, pictures with matplotlib; create their folders."""
     for file in filter(None, files):
+        if file.suffix in plots.SUFFIXES:
+            plots.check_matplotlib()
         file.parent.mkdir(parents=True, exist_ok=True)
         if file.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))

@@ -15,7 +15,7 @@ from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import save_npz
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.visualization import comparison, plots
+from jaxdrones.visualization import comparison
 
 _BACKENDS = "explicit,bullet"
 
@@ -101,8 +101,6 @@ def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
     """Paths of the logs by name; raise before the flights if a file cannot be written."""
     if options.output is None:
         return {}
-    if not options.no_figure:
-        plots.check_matplotlib()
     logs = {name: options.output / name / "log.npz" for name in names}
     check_writable(*logs.values(), None if options.no_figure else options.output / "compare.png")
     return logs

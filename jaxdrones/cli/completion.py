@@ -4,7 +4,7 @@ import argparse
 import functools
 from collections.abc import Iterator
 
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import choice
 from jaxdrones.cli.export import TARGETS
 from jaxdrones.cli.names import known_names
 from jaxdrones.cli.settings import REALISTIC_KINDS
@@ -36,11 +36,10 @@ def add(commands, root: argparse.ArgumentParser) -> None:
         "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
     )
     parser.add_argument("shell", metavar="SHELL", help=", ".join(SHELLS))
-    parser.set_defaults(run=functools.partial(_completion, root))
+    parser.set_defaults(run=functools.partial(_completion, root), ranges=dict(shell=choice("shell", SHELLS)))
 
 
 def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    check_choice("shell", options.shell, SHELLS)
     try:
         import shtab
     except ImportError:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from jaxdrones.arguments import number, whole
-from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, print_error
+from jaxdrones.cli.common import INTERRUPTED, check_writable, print_error
 from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
@@ -35,11 +35,11 @@ def add(commands) -> None:
         "--speed", type=float, default=1.0, metavar="X", help="real-time factor (1); scripts keep their own clock"
     )
     add_output(parser, "folder of the log (runs/crazyflie)", Path("runs") / "crazyflie")
-    parser.set_defaults(run=_run)
+    ranges = dict(port=whole("port", limit=_MAX_PORT), duration=number("s", above=0), speed=number(above=0))
+    parser.set_defaults(run=_run, ranges=ranges)
 
 
 def _run(options: argparse.Namespace) -> int:
-    check_options(options, port=whole("port", limit=_MAX_PORT), duration=number("s", above=0), speed=number(above=0))
     file = options.output / "log.npz"
     check_writable(file)
     recorder, interrupted = Recorder(), False

@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxdrones import arguments
 from jaxdrones.arguments import choice, number
-from jaxdrones.cli.common import DIVERGED, check_options, print_error
+from jaxdrones.cli.common import DIVERGED, print_error
 from jaxdrones.cli.options import add_backend, add_drones
 from jaxdrones.cli.policies import add_policy, open_policy, policy_of, team_of_run
 from jaxdrones.cli.report import evaluation_table, percent, print_results
@@ -34,7 +34,9 @@ def add(commands) -> None:
         "--fail-below", type=float, metavar="RATE", help="exit code 1 if the success rate is lower, for example 0.9"
     )
     evaluation.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
-    parser.set_defaults(run=_evaluate)
+    passing, backend = number(name="fail-below", above=0, at_most=1), choice("backend", BACKENDS)
+    ranges = dict(episodes=arguments.count, seed=arguments.seed, fail_below=passing, backend=backend)
+    parser.set_defaults(run=_evaluate, ranges=ranges)
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -43,8 +45,6 @@ def _evaluate(options: argparse.Namespace) -> int:
     from jaxdrones.learning import evaluate
     from jaxdrones.training.run import report_as_dict
 
-    passing, backend = number(name="fail-below", above=0, at_most=1), choice("backend", BACKENDS)
-    check_options(options, episodes=arguments.count, seed=arguments.seed, fail_below=passing, backend=backend)
     settings = asked_settings(options)
     team = team_of_run(options, settings)
     run = open_policy(options.policy, options.task, options.realistic, settings, options.last)

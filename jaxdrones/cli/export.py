@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdrones.arguments import choice
-from jaxdrones.cli.common import check_options, run_folder
+from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
@@ -26,13 +26,12 @@ def add(commands) -> None:
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
-    parser.set_defaults(run=_export)
+    parser.set_defaults(run=_export, ranges=dict(to=choice("target", TARGETS)))
 
 
 def _export(options: argparse.Namespace) -> int:
     from jaxdrones.export import save
 
-    check_options(options, to=choice("target", TARGETS))
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
     recipe, title, make_policy, _ = policy_of(run, options)
     own = is_user_policy(options.policy)

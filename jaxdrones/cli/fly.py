@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import arguments
-from jaxdrones.cli.common import check_options, check_writable, folder, print_error
+from jaxdrones.cli.common import check_writable, folder, print_error
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
@@ -89,15 +89,14 @@ def add(commands) -> None:
     files.add_argument("--csv", action="store_true", help="write the log as CSV too")
     files.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
     add_no_figure(files)
-    parser.set_defaults(run=functools.partial(_fly, parser))
+    ranges = dict(backend=arguments.choice("backend", BACKENDS), seed=arguments.seed)
+    parser.set_defaults(run=functools.partial(_fly, parser), ranges=ranges)
 
 
 def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.flight is None and options.policy is None:
         parser.error("the following arguments are required: FLIGHT, or --policy RUN")
     _refuse(parser, options)
-    if not options.no_figure:
-        plots.check_matplotlib()
     if options.video:
         options.renderer = films.choose_renderer(options.renderer, options.video)
     if options.cameras:
@@ -126,11 +125,9 @@ def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Non
 
 
 def _fly_example(options: argparse.Namespace) -> int:
-    if options.pwm:
-        check_pwm(options.vehicle)
     output = options.output or Path("runs") / options.flight
     check_conditions(options, backend=options.backend, obstacles=options.obstacles)
-    _check_files(options, output)
+    _check_files(options, output, options.vehicle)
     example = FLIGHTS[options.flight]
     title = f"{options.flight}: {example.summary}"
     with live_server(options.live, options.json) as live:
@@ -147,18 +144,15 @@ def _fly_policy(options: argparse.Namespace) -> int:
 
     from jaxdrones.training.episode import fly_episode, to_record
 
-    check_options(options, backend=arguments.choice("backend", BACKENDS), seed=arguments.seed)
     run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
     seed = options.seed or 0
     recipe = run.recipe()
     vehicle = "any vehicle" if recipe.realistic == "any" else str(recipe.options.get("vehicle", "cf2x"))
-    if options.pwm:
-        check_pwm(vehicle)
     output = options.output or output_folder(options.policy, "flight")
     team = team_of_run(options, {})
     with recipe.env(backend=options.backend, **team) as env, progress() as report:
         policy = run.policy(env=env)
-        _check_files(options, output)
+        _check_files(options, output, vehicle)
         title = f"{recipe.task}: {env.task.summary} ({recipe.algorithm}, {options.backend})"
         with live_server(options.live, options.json, title) as live:
             on_progress = report or (lambda fraction: None)
@@ -216,8 +210,10 @@ def _report(
         print("wrote " + ", ".join(map(str, files)))
 
 
-def _check_files(options: argparse.Namespace, output: Path) -> None:
-    """Raise before the flight if an output file cannot be written."""
+def _check_files(options: argparse.Namespace, output: Path, vehicle: str) -> None:
+    """Raise before the flight if an output file cannot be written, or a vehicle has no PWM signals."""
+    if options.pwm:
+        check_pwm(vehicle)
     names = ["log.npz", *["log.csv"] * options.csv, *["flight.png"] * (not options.no_figure)]
     check_writable(*(output / name for name in names))
     if options.cameras:

@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
-from jaxdrones.cli.common import DIVERGED, INTERRUPTED, check_options, folder, print_error, print_warning
+from jaxdrones.cli.common import DIVERGED, INTERRUPTED, folder, print_error, print_warning
 from jaxdrones.cli.options import add_backend, add_drones, add_vehicle
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
@@ -28,7 +28,7 @@ from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
 _MAX_HZ = 20_000
-_OF_REPLAY = ("bag", "speed", "json", "run", "debug")
+_OF_REPLAY = ("bag", "speed", "json", "run", "ranges", "debug")
 
 
 def add(commands) -> None:
@@ -58,14 +58,17 @@ def add(commands) -> None:
     watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="the same before the first command (30)")
     watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
     wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
-    parser.set_defaults(run=_run)
+    numbers = dict(drones=whole(), speed=number(above=0), duration=number("s", at_least=0), height=number("m", above=0))
+    names = dict(backend=choice("backend", BACKENDS), controller=choice("controller", CONTROLLERS))
+    ranges = numbers | names | dict(control_hz=whole("control rate (Hz)", limit=_MAX_HZ))
+    parser.set_defaults(run=_run, ranges=ranges)
     commands = parser.add_subparsers(metavar="[replay]", title="commands")
     replay = commands.add_parser("replay", help="publish the messages of a bag")
     replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
     replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
     for name in ("--json", "--debug"):  # as before `replay`
         replay.add_argument(name, action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    replay.set_defaults(run=functools.partial(_replay, parser))
+    replay.set_defaults(run=functools.partial(_replay, parser), ranges=dict(speed=number(above=0)))
 
 
 def join() -> Transport:
@@ -111,9 +114,6 @@ def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
 def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:
     """Team in hover, side by side."""
     n, hz = options.drones, options.control_hz
-    numbers = dict(drones=whole(), speed=number(above=0), duration=number("s", at_least=0), height=number("m", above=0))
-    names = dict(backend=choice("backend", BACKENDS), controller=choice("controller", CONTROLLERS))
-    check_options(options, control_hz=whole("control rate (Hz)", limit=_MAX_HZ), **numbers, **names)
     params = repeat(load_params(options.vehicle), n)
     state = State.at_rest([[0.0, _SPACING * (i - (n - 1) / 2), options.height] for i in range(n)])
     substeps = math.ceil(PHYSICS_HZ / hz)
@@ -142,7 +142,6 @@ def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int
     for name in vars(options):
         if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")
-    check_options(options, speed=number(above=0))
     with contextlib.closing(join()) as transport:
         report = _published(options, transport)
     _print(options, report)

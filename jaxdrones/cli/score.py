@@ -8,9 +8,9 @@ from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_log_options, load_logs
 from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError
+from jaxdrones.visualization.plots import SUFFIXES
 
 _NOMINAL = "cf2x"
-_PICTURES = (".png", ".pdf")
 
 
 def add(commands) -> None:
@@ -90,11 +90,8 @@ def _score(options: argparse.Namespace) -> int:
 def _check_figure(file: Path, has_paths: bool) -> None:
     if not has_paths:
         raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
-    if file.suffix not in _PICTURES:
-        raise UserError(f"--figure is {str(file)!r}; give a name that ends in {' or '.join(_PICTURES)}")
-    from jaxdrones.visualization.plots import check_matplotlib
-
-    check_matplotlib()
+    if file.suffix not in SUFFIXES:
+        raise UserError(f"--figure is {str(file)!r}; give a name that ends in {' or '.join(SUFFIXES)}")
     check_writable(file)
 
 

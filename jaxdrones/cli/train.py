@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from jaxdrones import arguments
 from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
@@ -22,6 +23,7 @@ from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
 
+_MAX_SEEDS = 1000
 _HOSTS_HELP = (
     "Worlds are sharded over all devices. Each core of a CPU counts as a device, up to four; JAX_NUM_CPU_DEVICES=N\n"
     "sets another number. On several hosts, start the same command on each, with a\n"
@@ -119,7 +121,8 @@ def add(commands) -> None:
     several.add_argument("--hosts", type=int, metavar="N", help="number of processes (1)")
     several.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
     several.add_argument("--coordinator", metavar="ADDRESS:PORT", help="address and free port of host 0")
-    parser.set_defaults(run=_on_hosts)
+    ranges = dict(seeds=arguments.whole(limit=_MAX_SEEDS), seed=arguments.seed, episodes=arguments.count)
+    parser.set_defaults(run=_on_hosts, ranges=ranges)
 
 
 def _on_hosts(options: argparse.Namespace) -> int:

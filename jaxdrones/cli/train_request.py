@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import arguments
-from jaxdrones.cli.common import check_options, run_folder
+from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.policies import warn_of_code
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT
 
-_MAX_SEEDS = 1000
 _MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -31,8 +30,6 @@ class Request(argparse.Namespace):
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
         """Request of a command line."""
-        seeds = arguments.whole(limit=_MAX_SEEDS)
-        check_options(options, seeds=seeds, seed=arguments.seed, episodes=arguments.count)
         if options.seed is not None:
             arguments.seed("the last seed", options.seed + options.seeds - 1)
         if options.resume and options.overwrite:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.arguments import choice, whole
-from jaxdrones.cli.common import check_options, check_writable, folder
+from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.options import add_output
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
@@ -51,11 +51,10 @@ def add(commands) -> None:
     filmed.add_argument("--camera", default="orbit", metavar="NAME", help=f"{', '.join(CAMERAS)} (orbit)")
     filmed.add_argument("--size", default="1280x720", metavar="WxH", help="size, pixels (1280x720)")
     filmed.add_argument("--fps", type=int, default=24, metavar="N", help="frames per second (24)")
-    parser.set_defaults(run=_view)
+    parser.set_defaults(run=_view, ranges=dict(camera=choice("camera", CAMERAS), fps=whole()))
 
 
 def _view(options: argparse.Namespace) -> int:
-    check_options(options, camera=choice("camera", CAMERAS), fps=whole())
     options.size = _size(options.size)
     if options.video:
         video.check_video(options.video)

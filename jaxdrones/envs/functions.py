@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_finite, check_params, check_quaternion, is_concrete, short_repr
+from jaxdrones.checks import check_params, is_concrete, short_repr
 from jaxdrones.control import Setpoint
+from jaxdrones.engine.team import check_state
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -98,17 +99,12 @@ def check_episode(
         if not _is_own(function):
             _check_values("a randomization", function, lambda key, draw=function: draw(key, one), check_params)
     if not _is_own(task.start):
-        _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], _check_state)
+        _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], check_state)
     return lengths
 
 
 def _scene_of(scene: Scene | DrawScene, key: jax.Array) -> Scene:
     return scene if isinstance(scene, Scene) else scene(key)
-
-
-def _check_state(state: State) -> None:
-    check_finite("state", state)
-    check_quaternion("state.quat", state.quat)
 
 
 def _check_values(what: str, function: Callable, draw: Callable, check: Callable) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.checks import UnexpectedKeyword, check_choice, check_function, check_keyword, hint, short_repr
+from jaxdrones.checks import UnexpectedKeyword, check_function, check_keyword, hint, look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks import (
     crowd,
@@ -58,8 +58,7 @@ def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
         return task
     if isinstance(task, str) and user_code.is_reference(task):
         return check_task_function(task, user_code.load(task))
-    check_choice("task", task, TASKS)
-    return TASKS[task]
+    return look_up("task", task, TASKS)
 
 
 def check_task_function(reference: str, function: Any) -> Callable[..., Task]:

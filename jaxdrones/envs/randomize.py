@@ -28,9 +28,11 @@ Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> measured state."""
 
 
-def _check_range(field: str, low: float, high: float) -> None:
-    for bound, value in ("lower", low), ("upper", high):
-        check_number(f"{bound} bound of {field}", value)
+def _check_range(field: str, low: float, high: float, **limit: Any) -> None:
+    """Raise unless this is a range; `limit` is that of its lower bound."""
+    bounds: tuple[tuple[str, float, dict[str, Any]], ...] = ("lower", low, limit), ("upper", high, {})
+    for bound, value, limits in bounds:
+        check_number(f"{bound} bound of {field}", value, **limits)
     if not low <= high:
         raise UserError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
@@ -38,9 +40,8 @@ def _check_range(field: str, low: float, high: float) -> None:
 @checked
 def scaled(field: Field, low: float, high: float) -> Randomization:
     """Nominal value times U(low, high), one factor for the whole array."""
-    _check_range(field, low, high)
-    sign: dict[str, Any] = {"above": 0} if field in POSITIVE else {"at_least": 0} if field in NOT_NEGATIVE else {}
-    check_number(f"lower bound of {field}", low, "a factor", **sign)
+    limit = {"above": 0} if field in POSITIVE else {"at_least": 0} if field in NOT_NEGATIVE else {}
+    _check_range(field, low, high, **limit)
 
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)

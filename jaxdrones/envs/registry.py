@@ -13,7 +13,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 
 from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
-from jaxdrones.checks import check_choice, check_finite, check_switch, short_repr
+from jaxdrones.checks import check_finite, check_switch, look_up, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
@@ -228,10 +228,7 @@ def _all_named(kind: str, values, table: dict, others: dict) -> list:
 
 
 def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
-    if not isinstance(value, str):
-        return value
-    check_choice(kind, value, table)
-    return table[value]
+    return look_up(kind, value, table) if isinstance(value, str) else value
 
 
 def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:

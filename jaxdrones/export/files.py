@@ -7,13 +7,14 @@ import dataclasses
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 
 from jaxdrones import writing
-from jaxdrones.checks import check_choice, short_repr
+from jaxdrones.arguments import checked, choice
+from jaxdrones.checks import short_repr
 from jaxdrones.envs import Env, explain
 from jaxdrones.errors import UserError
 from jaxdrones.export import c, js, onnx, stablehlo
@@ -40,8 +41,14 @@ class Exported:
     """Bytes of working memory and hidden state, for C and JavaScript."""
 
 
+@checked
 def save(
-    policy: Any, env: Env, to: str, folder: str | os.PathLike, name: str = "policy", title: str = ""
+    policy: Any,
+    env: Env,
+    to: Annotated[str, choice("target", TARGETS)],
+    folder: str | os.PathLike,
+    name: str = "policy",
+    title: str = "",
 ) -> list[Exported]:
     """Write the deterministic policy of a drone, with its normalization, for use without this library.
 
@@ -60,7 +67,6 @@ def save(
         ValueError: an unknown target, a policy that it cannot express, or a missing library.
         OSError: a file that cannot be written.
     """
-    check_choice("target", to, TARGETS)
     if not c.is_identifier(name):
         raise UserError(f"name is {name!r}; give a letter, then letters, digits and underscores")
     if not isinstance(policy, Policy):

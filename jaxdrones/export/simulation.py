@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import checked, whole
 from jaxdrones.control import CONTROLLERS, Setpoint
 from jaxdrones.dynamics import drag, ground_contact
 from jaxdrones.dynamics.rotors import instant_rotors
@@ -75,7 +75,8 @@ class Simulation:
     """Physics step, s."""
 
 
-def simulation(policy: Policy, env: Env, drones: int = 1) -> Simulation:
+@checked
+def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of drones")] = 1) -> Simulation:
     """Simulation of the nominal vehicle of an environment, flown by a policy or by controllers.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
@@ -90,7 +91,6 @@ def simulation(policy: Policy, env: Env, drones: int = 1) -> Simulation:
         ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.
         ImportError: without casadi (extra `casadi`).
     """
-    check_whole("number of drones", drones)
     _check(policy, env)
     params = jax.tree.map(lambda x: x[0], env.params)
     dt, zero = env.physics.dt, jnp.zeros(3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Annotated, Any, Protocol, cast, runtime_checkable
 
 import flax.linen as nn
 import flax.struct
@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_function, is_concrete
+from jaxdrones.arguments import checked, function
+from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -59,8 +60,8 @@ class OwnNetwork:
     floating-point arrays.
     """
 
-    def __init__(self, module: Any, output_size: int):
-        check_function("network", module, example="a flax or equinox module")
+    @checked
+    def __init__(self, module: Annotated[Any, function("a flax or equinox module", name="network")], output_size: int):
         self.module, self.output_size = module, output_size
         self.recurrent = hasattr(module, "initial_hidden_state")
         if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_concrete(x)):

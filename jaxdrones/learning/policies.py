@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import look_up
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint
@@ -37,15 +37,15 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
         ImportError: a policy whose package is not installed.
     """
     bundled = assets.policies()
-    check_choice("policy", name, [*bundled, *POLICIES])
+    found = look_up("policy", name, bundled | _NETWORKS)
     if name in bundled:
-        policy = checkpoint.load(bundled[name] / "best")
+        policy = checkpoint.load(found / "best")
         if env is not None:
             check_fits(name, policy, env)
         return policy
     if env is None:
         raise UserError(f"{name} adapts to a vehicle; give its environment, for example make_policy({name!r}, env)")
-    return AdaptivePolicy.of(name, _NETWORKS[name](), env)
+    return AdaptivePolicy.of(name, found(), env)
 
 
 def check_fits(name: str, policy: Policy, env: Env) -> None:

@@ -24,7 +24,7 @@ from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import Status, is_finite, raise_unless_ok, status_of
+from jaxdrones.status import OnFailure, Status, is_finite, raise_unless_ok, status_of
 
 _STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
 _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
@@ -94,7 +94,7 @@ def control(
     setpoints: Setpoint,
     *,
     dt: float,
-    on_failure: str = "hold",
+    on_failure: OnFailure = "hold",
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of a plan over the horizon.
 

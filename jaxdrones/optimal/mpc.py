@@ -20,7 +20,7 @@ from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.status import PlanningError, Status, is_finite
+from jaxdrones.status import OnFailure, PlanningError, Status, is_finite
 
 SOLVERS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 100, "mu_init": 1e-3}},
@@ -143,7 +143,7 @@ class Mpc:
 
     @checked
     def __call__(
-        self, state: OneState, setpoints: Setpoint, params: Params | None = None, *, on_failure: str = "hold"
+        self, state: OneState, setpoints: Setpoint, params: Params | None = None, *, on_failure: OnFailure = "hold"
     ) -> np.ndarray:
         """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
 

@@ -26,7 +26,7 @@ from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import Status, is_finite, raise_unless_ok, status_of
+from jaxdrones.status import OnFailure, Status, is_finite, raise_unless_ok, status_of
 
 
 class Settings(lqr.Settings, kw_only=True):
@@ -99,7 +99,7 @@ def control(
     setpoints: Setpoint,
     *,
     dt: float,
-    on_failure: str = "hold",
+    on_failure: OnFailure = "hold",
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of the averaged plan.
 

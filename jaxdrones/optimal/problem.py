@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_shape, is_concrete
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
@@ -18,7 +18,7 @@ from jaxdrones.optimal.coordinates import command_unit
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import check_on_failure, is_finite
+from jaxdrones.status import is_finite
 from jaxdrones.vector import along_z, cross, dot, safe_sqrt
 
 
@@ -131,9 +131,13 @@ def posed(
 
 
 def check_plan(horizon: int, setpoints: Setpoint, on_failure: str, *given: Any) -> None:
-    """Raise `ValueError` on a wrong number of setpoints, or another `on_failure` than those for the given arguments."""
+    """Raise `ValueError` on a wrong number of setpoints, or for `on_failure="raise"` with traced arguments."""
     check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
-    check_on_failure(on_failure, setpoints, *given)
+    if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves((setpoints, given)))):
+        raise UserError(
+            "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
+            "check the status of the memory"
+        )
 
 
 def check_period(step: Any, dt: float) -> None:

@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
 from jaxdrones.arguments import checked, whole
-from jaxdrones.checks import check_choice, check_params, check_shape, short_repr
+from jaxdrones.checks import look_up, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.errors import UserError
-from jaxdrones.params import Params, repeat
+from jaxdrones.params import Params, check_single, repeat
 from jaxdrones.state import State
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
 from jaxdrones.urdf import load_params
@@ -93,8 +93,7 @@ def tune(
             parameters of a team.
     """
     module = _tunable(controller)
-    check_params(params)
-    check_shape("params.mass", params.mass, (), "tune takes the parameters of a single drone")
+    check_single("params.mass", params, "tune takes the parameters of a single drone")
     gains, error = _descend(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
         raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")
@@ -118,8 +117,7 @@ def start(module: ModuleType, params: Params) -> Any:
 
 def _tunable(controller: str | ModuleType) -> ModuleType:
     if isinstance(controller, str):
-        check_choice("controller", controller, control.CONTROLLERS)
-        controller = control.CONTROLLERS[controller]
+        controller = look_up("controller", controller, control.CONTROLLERS)
     if not isinstance(controller, ModuleType) or controller not in _TUNED:
         known = ", ".join(map(_name, _TUNED))
         raise UserError(f"{_name(controller)} has no gains that could be tuned; give one of {known}")

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, short_repr
+from jaxdrones.arguments import checked, choices
+from jaxdrones.checks import short_repr
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.explicit import make_derivative
@@ -27,6 +28,7 @@ from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
 _BARE = Scene()
+_FIELDS = tuple(field.name for field in dataclasses.fields(Params) if field.name != "aux")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +75,7 @@ class CasadiModel:
         return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(getattr(params, name), float)) for name in fields)])
 
 
+@checked
 def casadi_model(
     vehicle: str | os.PathLike | Params,
     effects: Sequence[Effect] = (),
@@ -82,7 +85,7 @@ def casadi_model(
     models: Sequence[Model] = (),
     rotors: Rotors = instant_rotors,
     scene: Scene = _BARE,
-    parameters: Sequence[str] = (),
+    parameters: Annotated[Sequence[str], choices("field of Params", _FIELDS, "'wind'")] = (),
 ) -> CasadiModel:
     """Convert the equations of motion of `jaxdrones.make_derivative` to a CasADi function.
 
@@ -98,8 +101,6 @@ def casadi_model(
         NotImplementedError: an effect or model with an unsupported JAX primitive.
         ValueError: an unknown vehicle or parameter, or something else than what `make_derivative` takes.
     """
-    for name in parameters:
-        check_choice("field of Params", name, [f.name for f in dataclasses.fields(Params) if f.name != "aux"])
     with jax.enable_x64(True):
         loaded = vehicle if isinstance(vehicle, Params) else load_params(vehicle)
         params = jax.tree.map(_as_double, loaded)

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import Switch, checked
 from jaxdrones.checks import (
-    check_choice,
     check_finite,
     check_quaternion,
     check_shape,
     check_whole,
     is_concrete,
+    look_up,
     short_repr,
 )
 from jaxdrones.errors import UserError
@@ -168,7 +168,7 @@ class Scene(PyTreeNode, kw_only=True):
         """
         arrays: dict[str, Any] = {}
         for name, length in capacity.items():
-            check_choice("kind of obstacles", name, KINDS)
+            kind = look_up("kind of obstacles", name, KINDS)
             check_whole(f"capacity of {name}", length)
             stack = getattr(self, name)
             count = 0 if stack is None else len(stack.pos)
@@ -176,7 +176,7 @@ class Scene(PyTreeNode, kw_only=True):
                 raise UserError(
                     f"the scene has {count} {name} and the array holds {length}; give {name}={count} or more"
                 )
-            rest = _inactive(KINDS[name], length - count)
+            rest = _inactive(kind, length - count)
             arrays[name] = _joined([rest] if stack is None else [stack, rest])
         return self.replace(**arrays)
 

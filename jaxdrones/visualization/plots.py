@@ -38,6 +38,10 @@ _BAND = colors(1)[0]
 _WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
 
 
+SUFFIXES = (".png", ".pdf")
+"""Endings of pictures."""
+
+
 def check_matplotlib() -> None:
     """Raise `ValueError` where matplotlib cannot be used.
 

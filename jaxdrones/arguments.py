@@ -124,15 +124,15 @@ def checked(function: Function) -> Function:
     parameters = inspect.signature(called).parameters.values()
     positional = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     known = {p.name for p in parameters}
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    others = next((p.name for p in parameters if p.kind is p.VAR_KEYWORD), None)
 
     @functools.wraps(called)
     def checking(*args: Any, **kwargs: Any) -> Any:
         ranges = _ranges(function)
         for name, value in (*zip(positional, args, strict=False), *kwargs.items()):
-            if not (takes_any or name in known):
+            if name not in known and others is None:
                 checks.check_keyword(function.__qualname__, name, known - {"self", "cls"})
-            optional, to_pass = ranges.get(name, (False, ()))
+            optional, to_pass = ranges.get(name if name in known else others, (False, ()))
             for check in () if optional and value is None else to_pass:
                 check(name, value)
         return called(*args, **kwargs)
@@ -144,9 +144,10 @@ def checked(function: Function) -> Function:
 
 
 @functools.cache
-def _ranges(function: Callable[..., Any]) -> dict[str, tuple[bool, list[Check]]]:
+def _ranges(function: Callable[..., Any]) -> dict[str | None, tuple[bool, list[Check]]]:
     """Of every annotated argument, whether it may be `None`, and its checks."""
-    ranges, called = {}, function.__name__.replace("_", "-")
+    ranges: dict[str | None, tuple[bool, list[Check]]] = {}
+    called = function.__name__.replace("_", "-")
     for name, hint in typing.get_type_hints(function, include_extras=True).items():
         parts = hint, *typing.get_args(hint)
         stated = [_of_function(check, called) for part in parts for check in getattr(part, "__metadata__", ())]

@@ -51,3 +51,14 @@ class State(PyTreeNode):
         zero = jnp.zeros_like(yaw)
         quat = jnp.stack([zero, zero, jnp.sin(yaw / 2), jnp.cos(yaw / 2)], axis=-1)
         return cls(pos, quat, jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 4)))
+
+
+def _team(name: str, state: Any) -> None:
+    check_shape(
+        f"{name}.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap"
+    )
+    check_shape(f"{name}.quat", state.quat, (len(state.pos), 4), f"{name}.pos has {len(state.pos)} drones")
+
+
+TeamState = Annotated[State, _team]
+"""State of a team, with poses of every drone."""

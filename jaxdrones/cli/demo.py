@@ -6,7 +6,7 @@ import webbrowser
 from pathlib import Path
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import look_up
 from jaxdrones.cli import fly
 from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.live import add_live
@@ -46,21 +46,19 @@ def add(commands) -> None:
 
 def _demo(options: argparse.Namespace) -> int:
     exhibits = {exhibit.name: exhibit for exhibit in read_exhibits(assets.folder() / "demo")}
-    check_choice("flight", options.flight, exhibits)
+    flight = look_up("flight", options.flight, exhibits)
     if options.drones != 1 and options.policy is None:
         raise UserError(f"--drones {options.drones} is given without --policy; 'fly twenty' simulates twenty drones")
     if options.live is not None:
-        return _fly(exhibits[options.flight], options)
+        return _fly(flight, options)
     if options.policy is not None:
-        own = _own(options.policy, options.drones)
-        exhibits = {own.name: own} | exhibits
-        options.flight = own.name
+        flight = _own(options.policy, options.drones)
     output = options.output or Path("runs") / "demo.html"
     check_writable(output)
-    first = exhibits.pop(options.flight)
-    write(output, gallery([first, *exhibits.values()]).encode())
+    exhibits = {flight.name: flight} | exhibits
+    write(output, gallery(list(exhibits.values())).encode())
     size = f"{output.stat().st_size / 1e6:.1f} MB"
-    print_results(options, {"flights": [first.name, *exhibits], "files": [str(output)]}, f"wrote {output} ({size})")
+    print_results(options, {"flights": [*exhibits], "files": [str(output)]}, f"wrote {output} ({size})")
     if not options.no_open and not webbrowser.open(output.absolute().as_uri()):
         print("no browser was found; open the page in one")
     return 0

@@ -58,13 +58,12 @@ def _view(options: argparse.Namespace) -> int:
     options.size = _size(options.size)
     if options.video:
         video.check_video(options.video)
-        check_writable(options.video)
     if options.history:
         return _view_history(options)
     given, skipped = _flights(options.flights)
     names, logs = [*map(str, given)], [*given.values()]
     output = options.output or logs[0].with_name("flight.html")
-    check_writable(output)
+    check_writable(output, options.video)
     if skipped:
         print(f"skipped, as no flights: {', '.join(map(str, skipped))}", file=sys.stderr)
     flights = logs[0] if len(logs) == 1 else dict(zip(names, logs, strict=True))
@@ -79,7 +78,7 @@ def _view_history(options: argparse.Namespace) -> int:
         raise UserError("--history shows one run; give one folder")
     output = options.output or options.flights[0] / "history.html"
     run = open_policy(options.flights[0], None, False, {})
-    check_writable(output)
+    check_writable(output, options.video)
     recipe = run.recipe()
     with recipe.env() as env:
         evaluated = fly_history(run, env)

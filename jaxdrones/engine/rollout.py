@@ -27,7 +27,7 @@ def rollout(
     step: Advance,
     control: Annotated[Control, function("lambda params, memory, state, k: (memory, rpm)")],
     params: Params,
-    state: State,
+    state: Annotated[State, check_state],
     memory: Any,
     length: Count,
     checkpoint: Count | None = None,
@@ -53,7 +53,6 @@ def rollout(
             length.
     """
     check_params(params)
-    check_state(state)
     state = step.init(params, state) if isinstance(step, Step) else state
     if isinstance(step, HostStep) and checkpoint is not None:
         raise UserError("checkpoint is given and the bullet backend has no backward pass; leave it out")

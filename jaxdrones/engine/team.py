@@ -58,11 +58,11 @@ def _check_aux(name: str, aux: Any, n: int) -> None:
             raise UserError(f"{where} holds {jnp.result_type(leaf)}; give floating-point numbers")
 
 
-def check_state(state: State) -> None:
+def check_state(name: str, state: State) -> None:
     """Raise `ValueError` for concrete states that cannot fly."""
-    check_arrays(state=state)
-    check_finite("state", state)
-    check_quaternion("state.quat", state.quat)
+    check_arrays(**{name: state})
+    check_finite(name, state)
+    check_quaternion(f"{name}.quat", state.quat)
 
 
 class Layout(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -99,7 +100,8 @@ def check_episode(
         if not _is_own(function):
             _check_values("a randomization", function, lambda key, draw=function: draw(key, one), check_params)
     if not _is_own(task.start):
-        _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], check_state)
+        check = functools.partial(check_state, "state")
+        _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], check)
     return lengths
 
 

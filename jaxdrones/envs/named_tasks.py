@@ -52,18 +52,14 @@ TASKS: dict[str, Callable[..., Task]] = {
 }
 
 
-def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
-    """Function of a task: by a name of `TASKS`, from `file.py:function`, or the function itself."""
+def task_function(task: str | Callable[..., Task], load: Callable[[str], Any] = user_code.load) -> Callable[..., Task]:
+    """Function of a task: by a name of `TASKS`, from `file.py:function` by `load`, or the function itself."""
     if callable(task):
         return task
-    if isinstance(task, str) and user_code.is_reference(task):
-        return check_task_function(task, user_code.load(task))
-    return look_up("task", task, TASKS)
-
-
-def check_task_function(reference: str, function: Any) -> Callable[..., Task]:
-    """Validated function of a task from a user's file."""
-    check_function(reference, function, example="a function that returns a jaxdrones.tasks.Task")
+    if not (isinstance(task, str) and user_code.is_reference(task)):
+        return look_up("task", task, TASKS)
+    function = load(task)
+    check_function(task, function, example="a function that returns a jaxdrones.tasks.Task")
     return function
 
 

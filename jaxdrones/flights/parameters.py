@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.checks import check_whole, look_up
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 
@@ -82,11 +82,11 @@ def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
 
 def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
     """Expand names of parameters or fields to parameters, for example `inertia` to three axes."""
-    fields = {parameter.field for parameter in PARAMETERS.values()}
-    selected: dict[str, None] = {}
-    for name in names:
-        check_choice("parameter", name, sorted(fields | PARAMETERS.keys()))
-        selected |= dict.fromkeys(p.name for p in PARAMETERS.values() if name in (p.name, p.field))
+    known = {name: [name] for name in PARAMETERS}
+    for parameter in PARAMETERS.values():
+        if parameter.field != parameter.name:
+            known.setdefault(parameter.field, []).append(parameter.name)
+    selected = dict.fromkeys(each for name in names for each in look_up("parameter", name, known))
     check_whole("parameters", len(selected), limit=_MAX_PARAMETERS)
     return tuple(selected)
 

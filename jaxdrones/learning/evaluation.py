@@ -12,13 +12,12 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jaxtyping import Array, UInt32
 
-from jaxdrones.arguments import Key, checked
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import Count, Key, checked
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
-from jaxdrones.limits import LARGEST_COUNT, check_memory
+from jaxdrones.limits import check_memory
 from jaxdrones.pytree import PyTreeNode
 
 _CHUNK = 1000  # episodes simulated at a time
@@ -59,7 +58,7 @@ class Report(PyTreeNode):
 
 
 @checked
-def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: int = 1000) -> Report:
+def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: Count = 1000) -> Report:
     """Simulate whole episodes; steps after the end of an episode are ignored.
 
     Args:
@@ -81,8 +80,9 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: int = 1000) -> Rep
     return _report(env, jax.tree.map(np.asarray, outcomes))
 
 
+@checked
 def compile_evaluation(
-    env: Env, policy: Any, episodes: int, devices: Sequence[jax.Device] | None = None
+    env: Env, policy: Any, episodes: Count, devices: Sequence[jax.Device] | None = None
 ) -> Callable[[AnyPolicy, jax.Array], Report]:
     """Compile `evaluate` for policies of one structure on the explicit backend: (policy, key) -> report.
 
@@ -113,7 +113,6 @@ def compile_evaluation(
 
 def check_episodes(env: Env, episodes: int) -> None:
     """Raise if the episodes of an evaluation do not fit in memory."""
-    check_whole("episodes", episodes, limit=LARGEST_COUNT)
     check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
 

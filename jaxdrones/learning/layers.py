@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import look_up
 from jaxdrones.envs.env import Obs, RowSet
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
@@ -202,8 +202,6 @@ def make_network(
     strides: tuple[int, ...] = ()
     if isinstance(obs, dict):
         names = sorted(obs.keys() - {"state"})
-        for name in names:
-            check_choice("image for a policy", name, IMAGE_CHANNELS)
         batch = obs["state"].ndim - 1
         channels, strides = convolutions(*obs[names[0]].shape[batch : batch + 2])
     elif not (recurrent_size or sets):
@@ -222,7 +220,8 @@ def make_network(
 
 def image_channels(images: Mapping[str, Array], depth_scale: float) -> Float[Array, "*batch h w c"]:
     """Images as concatenated channels in [0, 1]; `depth_scale` is the depth with a nearness of 1/2, m."""
-    return jnp.concatenate([IMAGE_CHANNELS[name](images[name], depth_scale) for name in sorted(images)], axis=-1)
+    channels = {name: look_up("image for a policy", name, IMAGE_CHANNELS) for name in sorted(images)}
+    return jnp.concatenate([channel(images[name], depth_scale) for name, channel in channels.items()], axis=-1)
 
 
 def _normalize_rgb(rgb: Array, depth_scale: float) -> Float[Array, "*batch h w 3"]:

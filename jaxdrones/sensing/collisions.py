@@ -18,7 +18,7 @@ from jaxdrones.sensing.distances import fold_near, merged
 from jaxdrones.sensing.geometry import around_z, length
 from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.shapes import Cylinder, Obstacle
-from jaxdrones.state import State
+from jaxdrones.state import State, TeamState
 from jaxdrones.vector import dot, safe_sqrt, unit
 
 _MARGIN = 1e-3  # m; a drone at rest is 0.01 mm (Bullet) or 1.5 mm (`ground_contact`) inside the ground
@@ -41,7 +41,7 @@ class Collisions(PyTreeNode):
 @checked
 def collisions(
     params: Params,
-    state: State,
+    state: TeamState,
     scene: AnalyticScene = _BARE,
     margin: Annotated[ArrayLike, number("m", at_least=0)] = _MARGIN,
 ) -> Collisions:
@@ -59,10 +59,7 @@ def collisions(
     Raises:
         ValueError: a wrong shape, a mesh or URDF file in the scene, or a negative margin.
     """
-    hint = "one row per drone, at least one drone; for many worlds use jax.vmap"
-    check_shape("state.pos", state.pos, ("n", 3), hint)
     n = len(state.pos)
-    check_shape("state.quat", state.quat, (n, 4), f"state.pos has {n} drones")
     hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
     for name in "collision_radius", "collision_height", "collision_offset":
         check_shape(f"params.{name}", getattr(params, name), (n,), hint)

@@ -22,7 +22,7 @@ from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
 from jaxdrones.sensing.visibility import depth, visible
-from jaxdrones.state import State
+from jaxdrones.state import State, TeamState
 from jaxdrones.vector import along_z, cross, unit
 
 HUB, FRONT, BACK = (0.15, 0.15, 0.2, 1.0), (0.8, 0.15, 0.1, 1.0), (0.35, 0.35, 0.4, 1.0)
@@ -48,7 +48,7 @@ _Point = Annotated[ArrayLike, shape(3, meaning="m, world")]
 
 
 @checked
-def render(scene: AnalyticScene, params: Params, state: State, camera: OneCamera = _DEFAULT) -> Images:
+def render(scene: AnalyticScene, params: Params, state: TeamState, camera: OneCamera = _DEFAULT) -> Images:
     """Render the camera of every drone of a team.
 
     One ray a pixel is intersected with boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four
@@ -70,7 +70,6 @@ def render(scene: AnalyticScene, params: Params, state: State, camera: OneCamera
 
 
 def _check_team(params: Params, state: State) -> None:
-    check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")
 
 
@@ -90,7 +89,7 @@ def photograph(
 def view(
     scene: AnalyticScene,
     params: Params,
-    state: State,
+    state: TeamState,
     eye: _Point,
     target: _Point,
     camera: OneCamera = _DEFAULT,

@@ -15,12 +15,11 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.arguments import Switch, checked
+from jaxdrones.arguments import Switch, checked, whole
 from jaxdrones.checks import (
     check_finite,
     check_quaternion,
     check_shape,
-    check_whole,
     is_concrete,
     look_up,
     short_repr,
@@ -155,7 +154,8 @@ class Scene(PyTreeNode, kw_only=True):
         """Whether a point (3,) (m, world) is inside an obstacle or underground."""
         return self.distance(point) < 0
 
-    def padded(self, **capacity: int) -> Scene:
+    @checked
+    def padded(self, **capacity: Annotated[int, whole("capacity of {argument}")]) -> Scene:
         """Pad the arrays of a scene to given lengths with inactive obstacles.
 
         Worlds with different numbers of obstacles then have one structure, and can be stacked and mapped.
@@ -169,7 +169,6 @@ class Scene(PyTreeNode, kw_only=True):
         arrays: dict[str, Any] = {}
         for name, length in capacity.items():
             kind = look_up("kind of obstacles", name, KINDS)
-            check_whole(f"capacity of {name}", length)
             stack = getattr(self, name)
             count = 0 if stack is None else len(stack.pos)
             if count > length:

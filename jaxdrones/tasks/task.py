@@ -79,6 +79,7 @@ IMAGES = ("rgb", "depth", "segmentation")
 Drones = Annotated[int, arguments.whole("number of drones of {function}")]  # argument of a task
 Team = Annotated[int, arguments.whole("number of drones of {function}", 2)]
 _OF_A_WORLD = ("task", "world")
+_OBSERVE = arguments.function("", _OF_A_WORLD, "observe of an ObservationTerm")
 _OBSERVATION = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
 
 
@@ -87,7 +88,7 @@ _OBSERVATION = ("position_error", "rotation_matrix", "velocity_error", "omega", 
 class ObservationTerm:
     """One term of an observation."""
 
-    observe: Callable[[Task, World], Float[Array, "n d"]]
+    observe: Annotated[Callable[[Task, World], Float[Array, "n d"]], _OBSERVE]
     """(task, world with the measured state) -> entries of every drone."""
     bound: float | tuple[float, ...]
     """Largest magnitude, of all entries or of each, for clipping."""
@@ -104,7 +105,6 @@ class ObservationTerm:
     """Distance from which on a row has no effect, m."""
 
     def __post_init__(self):
-        check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
             check_number("bound of an observation", bound, above=0, infinite=True)
         if not callable(self.entries):

@@ -75,8 +75,19 @@ class Run:
             file.unlink()
 
     def sidecar(self, name: str = "best") -> dict[str, Any]:
-        """Sidecar of the checkpoint `best`, `last` or `state`."""
-        return files.read_sidecar(self.folder / name)
+        """Sidecar of the checkpoint `best`, `last` or `state`, of the same training as all readable files beside it."""
+        own = files.read_sidecar(self.folder / name)
+        for other in (*CHECKPOINTS, "report"):
+            try:
+                found = self._report() if other == "report" else files.read_sidecar(self.folder / other)
+            except (FileNotFoundError, ValueError):
+                continue  # damaged files are rejected at their use
+            if found.get("run_id") != own.get("run_id"):
+                raise UserError(
+                    f"{self.folder / name}.json and {other}.json are of two trainings; restore the files of one, or "
+                    "train again with --overwrite"
+                )
+        return own
 
     def sidecar_entry(self, name: str, entry: str) -> Any:
         """Entry of the sidecar of a checkpoint."""
@@ -88,31 +99,15 @@ class Run:
 
     def verify(self, name: str) -> None:
         """Check that a checkpoint is intact, and of the same training as the others."""
-        self.check_identity(name)
         files.load_bytes(self.folder / f"{name}.msgpack", self.sidecar(name))
 
-    def check_identity(self, name: str) -> None:
-        """Check that a checkpoint is of the same training as all readable files beside it."""
-        own = self.sidecar(name).get("run_id")
-        for other in (*CHECKPOINTS, "report"):
-            try:
-                found = self._report() if other == "report" else self.sidecar(other)
-            except (FileNotFoundError, ValueError):
-                continue  # damaged files are rejected at their use
-            if found.get("run_id") != own:
-                raise UserError(
-                    f"{self.folder / name}.json and {other}.json are of two trainings; restore the files of one, or "
-                    "train again with --overwrite"
-                )
-
     def recipe(self, name: str = "best") -> Recipe:
-        """Recipe of the training; raises like `check_identity`."""
-        self.check_identity(name)
+        """Recipe of the training."""
         return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
         """Policy `best`, `last` or one of `kept`."""
-        self.check_identity(name)
+        self.sidecar(name)  # is of this training
         policy = checkpoint.load(self.folder / name)
         if env is not None:
             check_fits(str(self.folder / name), policy, env)
@@ -159,7 +154,7 @@ class Run:
             return None
         report = self._report()
         if (self.folder / "best.json").exists():
-            self.check_identity("best")
+            self.sidecar("best")  # is of this training
         return report
 
     def _report(self) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.arguments import Count, checked
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
 from jaxdrones.learning.metrics import with_unknown
@@ -26,7 +27,8 @@ _DISK_FACTOR = 4  # number of training states that must fit on the disk
 class Trainer:
     """Compiled programs of a recipe, shared by all seeds; worlds are sharded over all devices of all hosts."""
 
-    def __init__(self, recipe: Recipe, episodes: int = 1000):
+    @checked
+    def __init__(self, recipe: Recipe, episodes: Count = 1000):
         """Prepare the programs, with this number of episodes in an evaluation; `compile` compiles them."""
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.make_mesh(recipe.config.worlds, _devices(recipe.config))

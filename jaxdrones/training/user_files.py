@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.envs.named_tasks import check_task_function
+from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 from jaxdrones.urdf import parse_params
@@ -39,10 +39,12 @@ def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None)
 
 def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
     """Task of a recipe for `jaxdrones.make`: a name, or the function of a file."""
-    if not user_code.is_reference(task):
-        return task
-    file, name = user_code.split_reference(task)
-    return check_task_function(task, user_code.definition(file.name, _text(file.name, files), name))
+
+    def load(reference: str) -> Any:
+        file, name = user_code.split_reference(reference)
+        return user_code.definition(file.name, _text(file.name, files), name)
+
+    return task_function(task, load) if user_code.is_reference(task) else task
 
 
 def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, Any]:

@@ -85,8 +85,7 @@ class BulletStep(HostStep):
         return jax.tree.map(lambda b, a: (b - a) / self.dt, after, state)
 
     def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
-        if is_traced((state, rpm, scene)) or (params is not self._params and is_traced(params)):
-            check_team(params, state, rpm)
+        if self._is_traced(params, state, rpm, scene):
             flown = _refuse_gradients(functools.partial(self._traced, substeps))
             return flown(params, state, rpm, self._given(scene))
         acting = self._set_scene(self._given(scene))
@@ -94,7 +93,7 @@ class BulletStep(HostStep):
         for k in range(substeps):
             loads = self._loads_on(team, aux, acting)
             if k == 0 and loads[:, arrays.SUSPECT].any():
-                check_state(state)
+                check_state("state", state)
                 check_finite("rpm", rpm)
             team = _following(np, self.client.advance(team, loads), team, loads)
         return _unpack(team.astype(self._flat_params.dtype), aux)
@@ -115,8 +114,7 @@ class BulletStep(HostStep):
         A camera inside an obstacle or underground sees it in black at `near`.
         """
         scene = self._given(scene)
-        if is_traced((params, state, scene)):
-            check_team(params, state, state.rpm)
+        if self._is_traced(params, state, state.rpm, scene):
             return self._traced_camera(params, state, camera, scene)
         self._set_scene(scene)
         team = self._place(params, state)
@@ -141,6 +139,13 @@ class BulletStep(HostStep):
         self._place(params, state)
         return photo(self.client, eye, target, camera)
 
+    def _is_traced(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None) -> bool:
+        """Whether a call is traced. Its shapes are then validated here, those of a concrete call in `_pack`."""
+        traced = is_traced((state, rpm, scene)) or (params is not self._params and is_traced(params))
+        if traced:
+            check_team(params, state, rpm)
+        return traced
+
     def _given(self, scene: Scene | None) -> Scene:
         self.client.check_open()
         if scene is None:
@@ -158,7 +163,7 @@ class BulletStep(HostStep):
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)
-        check_state(state)
+        check_state("state", state)
         self.client.place(team)
         return team
 

@@ -21,6 +21,7 @@ from jaxdrones.firmware.betaflight.link import connect_msp
 from jaxdrones.firmware.betaflight.pilots import Pilot
 from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
+from jaxdrones.training.betaflight_pilot import PolicyPilot
 
 _MAX_HZ = 8000
 _TAKE_OFF = 4.0  # s after arming from which the distance to the target counts, and a policy flies
@@ -158,8 +159,6 @@ def _pilot(
     if options.joystick is not None:
         return stack.enter_context(Joystick(options.joystick, options.axes)), None
     if options.policy is not None:
-        from jaxdrones.training.betaflight_pilot import PolicyPilot
-
         run = open_policy(options.policy, None, False, {})
         env = stack.enter_context(run.recipe().env(drones=1))
         if env.vehicle != options.vehicle:

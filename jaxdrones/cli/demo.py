@@ -79,7 +79,7 @@ def _fly(exhibit: Exhibit, options: argparse.Namespace) -> int:
 
 
 def _own(policy: Path, drones: int) -> Exhibit:
-    from jaxdrones.export import simulation
+    from jaxdrones.export import simulation  # needs casadi
 
     run = open_policy(policy, None, False, {})
     with run.recipe().env() as env:

@@ -2,11 +2,13 @@
 
 import argparse
 import importlib.metadata
+import platform
 import re
 import shutil
 import time
 from typing import Any
 
+from jaxdrones.cli import machine
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError, install
 
@@ -32,8 +34,6 @@ def add(commands) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from jaxdrones.cli import machine
-
     wrong: list[str] = []
     versions = machine.versions()
     required, extras = _requirements(wrong)
@@ -95,8 +95,6 @@ def _requirements(wrong: list[str]) -> tuple[dict[str, str], dict[str, list[re.M
 
 def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str, Any]:
     """Missing libraries of an extra, and how to install them."""
-    import platform
-
     missing, unavailable = [], []
     for found in libraries:
         limit = re.search(r"python_version (<=?|>=?) ['\"]([\d.]+)['\"]", found["marker"] or "")

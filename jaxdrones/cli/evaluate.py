@@ -3,6 +3,8 @@
 import argparse
 from typing import Any
 
+import jax
+
 from jaxdrones import arguments
 from jaxdrones.arguments import choice, number
 from jaxdrones.cli.common import DIVERGED, print_error
@@ -12,6 +14,8 @@ from jaxdrones.cli.report import evaluation_table, percent, print_results
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.learning import evaluate
+from jaxdrones.training.run import report_as_dict
 
 _FIRST_SEED = 1_000_000  # distinct from the seeds of trainings
 
@@ -40,11 +44,6 @@ def add(commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    import jax
-
-    from jaxdrones.learning import evaluate
-    from jaxdrones.training.run import report_as_dict
-
     settings = asked_settings(options)
     team = team_of_run(options, settings)
     run = open_policy(options.policy, options.task, options.realistic, settings, options.last)

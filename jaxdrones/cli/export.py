@@ -8,6 +8,7 @@ from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import asked_settings
+from jaxdrones.export import save
 
 TARGETS = ("c", "onnx", "stablehlo", "js")
 
@@ -30,8 +31,6 @@ def add(commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from jaxdrones.export import save
-
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
     recipe, title, make_policy, _ = policy_of(run, options)
     own = is_user_policy(options.policy)

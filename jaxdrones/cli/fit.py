@@ -8,7 +8,16 @@ from pathlib import Path
 from jaxdrones.cli.common import check_writable, folder, print_warning
 from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle
 from jaxdrones.cli.report import print_results
+from jaxdrones.control import firmware_pid
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
+from jaxdrones.flights import fit, inconsistencies, load_flights
+from jaxdrones.flights.files import find_log
+from jaxdrones.flights.report import check_no_fit, report_as_dict, write_vehicle
+from jaxdrones.flights.vehicle import REPORT, URDF
+from jaxdrones.urdf import load_params
+from jaxdrones.visualization.plots import check_matplotlib
+from jaxdrones.visualization.residuals import save_errors
 
 _FIGURE = "errors.png"
 
@@ -47,16 +56,6 @@ def add(commands) -> None:
 
 
 def _fit(options: argparse.Namespace) -> int:
-    from jaxdrones.control import firmware_pid
-    from jaxdrones.dynamics.propulsion import crazyflie_motors
-    from jaxdrones.flights import fit
-    from jaxdrones.flights.files import find_log
-    from jaxdrones.flights.report import check_no_fit, report_as_dict, write_vehicle
-    from jaxdrones.flights.vehicle import REPORT, URDF
-    from jaxdrones.urdf import load_params
-    from jaxdrones.visualization.plots import check_matplotlib
-    from jaxdrones.visualization.residuals import save_errors
-
     params = load_params(options.vehicle)
     motors, gains = crazyflie_motors(options.propellers), firmware_pid.gains(propellers=options.propellers)
     names = [name.strip() for name in (options.parameters or "").split(",") if name.strip()]
@@ -95,8 +94,6 @@ def add_log_options(group) -> None:
 
 def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
     """Load the drones of logs with unique names; warn of allowed contradictions."""
-    from jaxdrones.flights import inconsistencies, load_flights
-
     logs = load_flights(*files, allow_inconsistent=allow_inconsistent)
     for log in logs if allow_inconsistent else ():
         for found in inconsistencies(log):

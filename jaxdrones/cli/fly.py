@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from jaxdrones import arguments
 from jaxdrones.cli.common import check_writable, folder, print_error
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
@@ -21,6 +23,7 @@ from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import check_pwm, save_csv, save_npz
 from jaxdrones.flights.log import FlightLog, LoggedConditions
+from jaxdrones.training.episode import fly_episode, to_record
 from jaxdrones.visualization import films, paths, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
@@ -140,10 +143,6 @@ def _fly_example(options: argparse.Namespace) -> int:
 
 
 def _fly_policy(options: argparse.Namespace) -> int:
-    import jax
-
-    from jaxdrones.training.episode import fly_episode, to_record
-
     run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
     seed = options.seed or 0
     recipe = run.recipe()

@@ -6,7 +6,10 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
+
 from jaxdrones.cli.report import percent
+from jaxdrones.training.episode import fly_episode
 from jaxdrones.visualization.viewer.live import Live
 
 WAIT = 60.0
@@ -51,10 +54,6 @@ class LiveTraining:
         self._then(count, now)
 
     def _show(self, count: int, now: dict[str, float]) -> None:
-        import jax
-
-        from jaxdrones.training.episode import fly_episode
-
         env, score = self._trainer.env, now["success" if self._name == "success" else "evaluated_return"]
         self._curve.append((count, score))
         episode = fly_episode(env, self._run.policy("last", env), jax.random.key(0))

@@ -14,13 +14,14 @@ from jaxdrones.cli.options import add_set, add_vehicle
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic
 from jaxdrones.errors import UserError
+from jaxdrones.learning.policies import POLICIES
+from jaxdrones.training.run import Run
+from jaxdrones.training.user_policy import UserPolicy
 from jaxdrones.user_code import is_reference
 
 
 def is_user_policy(policy: Path) -> bool:
     """Whether this is a policy of a user's file, `file.py:name`, or a published one, not the folder of a run."""
-    from jaxdrones.learning.policies import POLICIES
-
     return is_reference(str(policy)) or (str(policy) in POLICIES and not policy.exists())
 
 
@@ -79,9 +80,6 @@ def open_policy(
     A run and a bundled policy have their own task and options: for them `task` is `None`, `realistic` false and
     `options`, those of `jaxdrones.make`, are empty. `last` opens the newest policy of a run, not the best.
     """
-    from jaxdrones.training.run import Run
-    from jaxdrones.training.user_policy import UserPolicy
-
     if is_user_policy(policy):
         if task is None:
             raise UserError(f"--task is missing; give the task that {policy} flies, for example --task hover")

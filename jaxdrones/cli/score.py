@@ -4,11 +4,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_log_options, load_logs
 from jaxdrones.cli.report import print_results
+from jaxdrones.control import firmware_pid
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
+from jaxdrones.flights import errors_as_dict, hold_errors, load_vehicle, open_loop_errors, simulate_closed_loop
 from jaxdrones.visualization.plots import SUFFIXES
+from jaxdrones.visualization.residuals import save_paths
 
 _NOMINAL = "cf2x"
 
@@ -38,13 +44,6 @@ def add(commands) -> None:
 
 
 def _score(options: argparse.Namespace) -> int:
-    import numpy as np
-
-    from jaxdrones.control import firmware_pid
-    from jaxdrones.dynamics.propulsion import crazyflie_motors
-    from jaxdrones.flights import errors_as_dict, hold_errors, load_vehicle, open_loop_errors, simulate_closed_loop
-    from jaxdrones.visualization.residuals import save_paths
-
     motors = crazyflie_motors(options.propellers)
     vehicles = {"nominal": load_vehicle(options.nominal), "vehicle": load_vehicle(options.vehicle)}
     logs = load_logs(options.logs, options.allow_inconsistent)

@@ -21,6 +21,14 @@ from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
+from jaxdrones.learning import Diverged
+from jaxdrones.learning.loggers import named_loggers
+from jaxdrones.training import distributed, loop
+from jaxdrones.training.distributed import fail_together
+from jaxdrones.training.lock import locked
+from jaxdrones.training.presets import settings_known
+from jaxdrones.training.run import Run
+from jaxdrones.training.trainer import Trainer
 from jaxdrones.visualization import plots
 
 _MAX_SEEDS = 1000
@@ -135,8 +143,6 @@ def _on_hosts(options: argparse.Namespace) -> int:
         raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.live is not None:
         raise UserError("--live is given with --hosts; leave one of them out")
-    from jaxdrones.training import distributed
-
     with contextlib.ExitStack() as stack:
         stack.enter_context(distributed.join_hosts(*hosts))
         if options.host > 0:
@@ -152,8 +158,6 @@ def _on_hosts(options: argparse.Namespace) -> int:
 
 def _train(options: argparse.Namespace) -> int:
     """Parse the request, and train each row of its sweep."""
-    from jaxdrones.training.distributed import fail_together
-
     begin = time.perf_counter()
     with fail_together():
         if not options.no_figure:
@@ -169,12 +173,6 @@ def _train(options: argparse.Namespace) -> int:
 
 def _train_row(request: Request, begin: float) -> int:
     """Lock the folders of a request, and train."""
-    from jaxdrones.training import loop
-    from jaxdrones.training.distributed import fail_together
-    from jaxdrones.training.lock import locked
-    from jaxdrones.training.run import Run
-    from jaxdrones.training.trainer import Trainer
-
     with contextlib.ExitStack() as stack:
         with fail_together():
             for folder in dict.fromkeys((request.output, *request.folders.values())):
@@ -192,11 +190,6 @@ def _train_row(request: Request, begin: float) -> int:
 
 def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines) -> int:
     """Train every run in its locked folder, and print the results."""
-    from jaxdrones.learning import Diverged
-    from jaxdrones.learning.loggers import named_loggers
-    from jaxdrones.training import loop
-    from jaxdrones.training.run import Run
-
     print_line = train_output.quiet if request.json else print
     config, what = trainer.recipe.config, described(trainer.recipe) + f", {request.row}" * bool(request.row)
     loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
@@ -229,8 +222,6 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
 
 def _compile(request: Request, runs: dict, trainer: Any, what: str, print_line: Callable) -> None:
     """Compile the programs, and print what is trained and for how long."""
-    from jaxdrones.training.presets import settings_known
-
     recipe, config = trainer.recipe, trainer.recipe.config
     if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
         train_output.warn_of_unknown_settings(recipe)

@@ -10,6 +10,9 @@ from typing import Any
 from jaxdrones.cli.common import bar, print_warning
 from jaxdrones.cli.report import as_json, evaluation_table, percent
 from jaxdrones.cli.train_request import Request
+from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.training.plan import best_of, score_of
+from jaxdrones.training.run import Run
 from jaxdrones.visualization import learning_curves
 
 
@@ -128,8 +131,6 @@ def remaining_best(run) -> str:
 
 def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
     """Draw the learning curves, unless with --no-figure."""
-    from jaxdrones.learning.evaluation import wilson_interval
-
     if request.no_figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
@@ -144,9 +145,6 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
 
 def show_results(request: Request, runs: dict) -> int:
     """Draw learning curves, choose the best seed, and print the results."""
-    from jaxdrones.training.plan import best_of, score_of
-    from jaxdrones.training.run import Run
-
     output = request.output
     reports = {seed: run.report() for seed, run in runs.items()}
     evaluations = [report["evaluation"] for report in reports.values()]

@@ -14,7 +14,12 @@ from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.policies import warn_of_code
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
+from jaxdrones.learning.loggers import logger_names
 from jaxdrones.limits import LARGEST_COUNT
+from jaxdrones.training import user_files
+from jaxdrones.training.presets import default_algorithm
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
 
 _MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -34,8 +39,6 @@ class Request(argparse.Namespace):
             arguments.seed("the last seed", options.seed + options.seeds - 1)
         if options.resume and options.overwrite:
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
-        from jaxdrones.learning.loggers import logger_names
-
         logger_names(options.log)
         updates, seconds = parse_budget(options.budget)
         settings = asked_settings(options)
@@ -79,8 +82,6 @@ class Request(argparse.Namespace):
 
     def runs(self) -> dict:
         """Run of each seed."""
-        from jaxdrones.training.run import Run
-
         run = Run(self.output)
         if self.seeds > 1:
             if self.resume and run.started:
@@ -100,10 +101,6 @@ class Request(argparse.Namespace):
         return next(started, 1000 if self.episodes is None else self.episodes)
 
     def _new_recipe(self, runs: dict):
-        from jaxdrones.training.presets import default_algorithm
-        from jaxdrones.training.recipe import Recipe
-        from jaxdrones.training.run import Run
-
         algorithm = default_algorithm(self.task) if self.algo is None else self.algo
         recipe = Recipe.of(self.task, algorithm, self.realistic, **self.settings)
         for run in (*runs.values(), Run(self.output)):
@@ -113,9 +110,6 @@ class Request(argparse.Namespace):
 
     def _resumed_recipe(self, runs: dict):
         """Recipe of the runs with the requested number of updates; all other settings must be unchanged."""
-        from jaxdrones.training import user_files
-        from jaxdrones.training.recipe import Recipe
-
         started = [run for run in runs.values() if run.started]
         if not started:
             raise _nothing_to_resume(next(iter(runs.values())))

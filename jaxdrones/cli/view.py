@@ -14,6 +14,7 @@ from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
+from jaxdrones.training.history import fly_history
 from jaxdrones.visualization import video
 from jaxdrones.visualization.viewer.film import CAMERAS, film
 from jaxdrones.visualization.viewer.history import show_history
@@ -72,8 +73,6 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _view_history(options: argparse.Namespace) -> int:
-    from jaxdrones.training.history import fly_history
-
     if len(options.flights) > 1:
         raise UserError("--history shows one run; give one folder")
     output = options.output or options.flights[0] / "history.html"

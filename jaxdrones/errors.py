@@ -1,7 +1,5 @@
 """Error of users' mistakes, and installation hints."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import json
 import urllib.parse

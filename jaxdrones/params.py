@@ -1,7 +1,5 @@
 """Constants of a vehicle and of the air around it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Base class of pytrees."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Status of planners and fits."""
 
-from __future__ import annotations
-
 import enum
 from typing import Annotated, Any
 

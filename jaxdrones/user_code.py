@@ -1,7 +1,5 @@
 """Objects of users' Python files, named `file.py:name`."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import inspect

@@ -18,8 +18,6 @@ laws have these forms:
 - maximum speed: sqrt(g l), Froude scaling (Kushleyev, Mellinger, Powers and Kumar 2013).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

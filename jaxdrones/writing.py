@@ -1,7 +1,5 @@
 """Atomic writing of files by renaming."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator

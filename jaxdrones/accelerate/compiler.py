@@ -4,8 +4,6 @@ They are used only here. If a version of JAX lacks one of them, `AVAILABLE` is F
 `UnknownError`, with a fallback in the callers.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any

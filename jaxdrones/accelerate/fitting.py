@@ -1,7 +1,5 @@
 """Eligibility of programs for a single kernel of XLA's CPU compiler, by their primitives."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Two layouts of arrays over worlds, and primitives with one array per entry."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

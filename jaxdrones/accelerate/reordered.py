@@ -1,7 +1,5 @@
 """Storage of arrays used in several orders, each of which can double the code of XLA's CPU compiler."""
 
-from __future__ import annotations
-
 import collections
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Storage of common subexpressions, which XLA's CPU compiler would recompute in each expression."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`jit_small`: compilation of functions of few numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

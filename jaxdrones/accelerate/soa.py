@@ -5,8 +5,6 @@ and recomputes common subexpressions. Here every entry is a separate array (worl
 transposing are free, and common subexpressions are stored once.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

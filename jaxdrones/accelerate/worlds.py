@@ -1,7 +1,5 @@
 """`over_worlds`: fast simulation of many worlds."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import warnings

@@ -1,7 +1,5 @@
 """Versions of libraries, description of the machine, and how JAX uses it."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib.metadata

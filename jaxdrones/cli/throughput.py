@@ -1,7 +1,5 @@
 """Benchmark programs and timers: the plant, the plant under a controller, and an environment."""
 
-from __future__ import annotations
-
 import functools
 import statistics
 import time

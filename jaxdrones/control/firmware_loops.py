@@ -5,8 +5,6 @@ description. Angles are in degrees and rates in degrees per second; pitch is pos
 heading frame is the world frame, rotated by yaw. Thrust and torque are in units of the firmware's 16-bit commands.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 

@@ -4,8 +4,6 @@ The constants are those of the firmware (Bitcraze, 2025.12): the thrust of one m
 across it, and a command is a fraction of the maximum thrust, at any voltage of the battery.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import jax.numpy as jnp

@@ -5,8 +5,6 @@ vehicle. The position loop commands `pos_p` times the distance, without the velo
 lags a moving set-point by 0.5 s. 16-bit numbers are limited as in the firmware, but not rounded, to be differentiable.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -1,7 +1,5 @@
 """Geometric tracking on SE(3) (Lee, Leok, McClamroch 2010; the attitude target after Mellinger and Kumar 2011)."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import jax.numpy as jnp

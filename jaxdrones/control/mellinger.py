@@ -6,8 +6,6 @@ and rates of the set-point. Thrust and torque are 16-bit numbers, limited as in 
 rotors with a lag of less than 0.1 s: with the fall time of 0.25 s of `cf2x` it oscillates.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 

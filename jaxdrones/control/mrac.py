@@ -6,8 +6,6 @@ the poles of the model at -1 to -12 1/s. This closed loop is the reference model
 Annaswamy, Stable Adaptive Systems, chapter 3).
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

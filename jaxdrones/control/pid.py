@@ -4,8 +4,6 @@ It originates from the Dynamic Systems Lab of the University of Toronto. For eve
 units of the Crazyflie's 16-bit PWM.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

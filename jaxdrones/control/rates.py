@@ -1,7 +1,5 @@
 """Control of collective thrust and body rates in an outer and an inner loop."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax.numpy as jnp

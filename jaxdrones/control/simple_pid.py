@@ -3,8 +3,6 @@
 The desired force gives the angles; thrust and torque give the rotor speeds by least squares.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 

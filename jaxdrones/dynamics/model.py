@@ -1,7 +1,5 @@
 """Models with a continuous state, for example a battery, a gust filter, flapping blades or a motor controller."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Declarations of effects and pair effects for the engines."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

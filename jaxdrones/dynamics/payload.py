@@ -11,8 +11,6 @@ the load at rest, so the tension is continuous where a cable becomes taut; it ne
 The drone is pulled by T e, the load by -T e, so momentum and angular momentum are conserved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Neighbor search in a large team by a grid of cells as wide as the interaction cutoff."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Sum of wrenches and models of a team, shared by the backends."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """Interfaces of steps."""
 
-from __future__ import annotations
-
 import abc
 from typing import Any
 

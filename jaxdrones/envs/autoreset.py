@@ -1,7 +1,5 @@
 """Automatic reset in the step that ends an episode."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

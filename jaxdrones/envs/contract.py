@@ -1,7 +1,5 @@
 """Contract test for environments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

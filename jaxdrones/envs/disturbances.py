@@ -1,7 +1,5 @@
 """Disturbances of wind or external force during an episode: random pushes and Dryden turbulence."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

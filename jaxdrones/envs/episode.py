@@ -1,7 +1,5 @@
 """Phases of an episode: start, command and outcome of a control step. `env` is an `Env`."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

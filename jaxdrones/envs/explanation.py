@@ -1,7 +1,5 @@
 """Descriptions of observations, actions, rewards and simulation of an environment, as text and JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence

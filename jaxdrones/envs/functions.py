@@ -1,7 +1,5 @@
 """Validation of users' functions (of tasks, scenes and policies) and of the calling process."""
 
-from __future__ import annotations
-
 import functools
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Tasks by name, from functions and from users' files."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Collection
 from typing import Any

@@ -3,8 +3,6 @@
 `kinematics` is equation 7 of the paper, `adjacency` equation 8; images (equation 9) belong to the environment.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

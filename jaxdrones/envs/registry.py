@@ -1,7 +1,5 @@
 """`make`: environments by name."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

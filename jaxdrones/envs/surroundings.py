@@ -1,7 +1,5 @@
 """Observations of the other drones of a team and of obstacles."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import jax

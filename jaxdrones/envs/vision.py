@@ -1,7 +1,5 @@
 """Camera images as observations (equation 9 of the paper), on either backend."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

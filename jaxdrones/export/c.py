@@ -1,7 +1,5 @@
 """Policies as a C99 header without memory allocation, for a flight controller."""
 
-from __future__ import annotations
-
 import re
 
 from jaxdrones.export.calls import Call, Program, Span

@@ -3,8 +3,6 @@
 CasADi removes common subexpressions and operations with constants of the traced program, see `optimal.interpreter`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

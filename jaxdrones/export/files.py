@@ -1,7 +1,5 @@
 """Files of an exported policy."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Policies as an ES module in float32, for the browser and Node.js."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from jaxdrones.export.calls import Call, Program, Span

@@ -1,7 +1,5 @@
 """Layers of an exported network, from which C, JavaScript and ONNX are written."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Layers of a policy: the only knowledge of its network that the targets have."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Policies as ONNX models with a dynamic batch."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from typing import Any

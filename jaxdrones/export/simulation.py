@@ -1,7 +1,5 @@
 """Simulation of drones in a web page: physics, controllers and a policy as JavaScript, without a server."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Policies as StableHLO programs of `jax.export`, with a symbolic batch."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Text that the targets share: the description of inputs and outputs, and numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import textwrap
 from typing import Any

@@ -1,7 +1,5 @@
 """Drone whose motors a firmware commands: its physics, measurements, clock and records."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from typing import Any

@@ -1,7 +1,5 @@
 """Closed-loop simulation with the firmware's PID on the set-points of a recorded flight."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

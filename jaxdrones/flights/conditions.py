@@ -1,7 +1,5 @@
 """Conditions of a flight: kind, vehicle, physics and controller."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

@@ -5,8 +5,6 @@ thrust along body z, and the angular acceleration follows the motors. A test nee
 `docs/reality.md` has the margins on recorded flights.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Log files: .npz, .csv, and ROS 2 bags."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

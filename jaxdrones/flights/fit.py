@@ -1,7 +1,5 @@
 """Output-error identification of vehicle parameters from recorded flights."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

@@ -1,7 +1,5 @@
 """Levenberg-Marquardt, and normal equations of a robust sum of squares over windows of a flight."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Motion of a flight in one column of its log, compared with that implied by others."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

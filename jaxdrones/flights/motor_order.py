@@ -1,7 +1,5 @@
 """Check of the order of the motors in a log by roll and pitch accelerations."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Open-loop prediction from logged states with recorded inputs, and its errors."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """Identifiable parameters of a vehicle by name."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

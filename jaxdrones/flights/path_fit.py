@@ -1,7 +1,5 @@
 """Closed-loop identification of vehicle parameters from the paths of flights on set-points."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Preparation of logs for identification: one drone each, at 100 Hz, with plausible units and consistent columns."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Report of a fit: `vehicle.urdf` and `report.json`."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

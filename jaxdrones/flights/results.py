@@ -1,7 +1,5 @@
 """Results of a flight: errors, settling times, divergence, and comparison of two flights."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from jaxdrones.flights.log import FlightLog

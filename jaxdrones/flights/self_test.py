@@ -1,7 +1,5 @@
 """Self-test of physics, compiler and device: a short flight with a closed-form solution."""
 
-from __future__ import annotations
-
 import contextlib
 from typing import Any
 

@@ -4,8 +4,6 @@ Tassa, Mansard, Todorov 2014, "Control-limited differential dynamic programming"
 derivatives of the dynamics are neglected, as in iLQR (Li, Todorov 2004). Attitudes are in the tangent space.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.struct

@@ -4,8 +4,6 @@ An array is a NumPy array of numbers, or of objects: numbers and scalar `casadi.
 evaluated by JAX. Equations that only rearrange entries are evaluated by JAX on their indices.
 """
 
-from __future__ import annotations
-
 import itertools
 import operator
 from collections.abc import Callable, Sequence

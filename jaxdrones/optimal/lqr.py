@@ -1,7 +1,5 @@
 """Linear quadratic regulator about hover with feedforward of the target's motion."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.struct

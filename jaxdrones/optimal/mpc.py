@@ -1,7 +1,5 @@
 """Nonlinear model predictive control of one drone with CasADi: multiple shooting with the symbolic twin."""
 
-from __future__ import annotations
-
 import time
 from typing import Annotated, Any
 

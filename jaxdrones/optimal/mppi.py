@@ -6,8 +6,6 @@ stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Will
 relative to the spread of the costs, and the cost of the noise itself is left out.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.struct

@@ -1,7 +1,5 @@
 """JAX primitives as functions of CasADi scalars. True is one, false zero."""
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Callable

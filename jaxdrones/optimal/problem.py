@@ -1,7 +1,5 @@
 """Cost functions and reference motions of optimal controllers."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

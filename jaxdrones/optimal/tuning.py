@@ -1,7 +1,5 @@
 """Gradient-based tuning of a controller's gains in simulated test flights."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from types import ModuleType

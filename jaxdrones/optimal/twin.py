@@ -1,7 +1,5 @@
 """Symbolic twin: the equations of motion as a CasADi function."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Sequence

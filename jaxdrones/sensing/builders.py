@@ -3,8 +3,6 @@
 Random scenes have the same array shapes for every key, so one compiled program serves any number of worlds.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import jax

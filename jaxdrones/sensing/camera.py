@@ -1,7 +1,5 @@
 """Camera of a drone and depth noise, for both backends."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated, Any

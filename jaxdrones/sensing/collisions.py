@@ -1,7 +1,5 @@
 """Collision flags of a team; they depend on poses alone and are the same on every backend."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import jax

@@ -1,7 +1,5 @@
 """Signed distances and nearest points of solids."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

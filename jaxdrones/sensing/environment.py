@@ -1,7 +1,5 @@
 """Barometer and magnetometer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

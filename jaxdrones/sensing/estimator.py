@@ -1,7 +1,5 @@
 """On-board state estimation from an IMU and motion capture."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Obstacles from mesh and URDF files, for the Bullet backend only."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Geometry of convex solids as products and unions of intervals, in the frame of one solid."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 

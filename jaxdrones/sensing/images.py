@@ -1,7 +1,5 @@
 """Images of cameras: metric depth, segmentation and color, by analytic rays."""
 
-from __future__ import annotations
-
 import functools
 from typing import Annotated, Any, NamedTuple
 

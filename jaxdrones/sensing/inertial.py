@@ -1,7 +1,5 @@
 """Inertial measurement units: accelerometer and gyroscope, with errors of named parts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -6,8 +6,6 @@ rotation (rad) from the estimated to the true body in body axes, and the biases 
 sections 5 and 6.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 

@@ -1,7 +1,5 @@
 """Motion capture, with noise, delay and dropouts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Sensor errors in terms of the Allan deviation: white noise, bias instability, random walk."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

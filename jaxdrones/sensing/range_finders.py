@@ -4,8 +4,6 @@ The defaults are the rates and ranges of the named devices, without noise: data 
 light only.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """Sensors of a drone: interface, initialization and measurement."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Scenes as JSON."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shading: Lambert's law under one sun, a checkered ground, and a sky."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ sphere is a rounded point and a capsule a rounded line segment; a box and a cyli
 are about a single obstacle, in its own frame.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Scenes from the collision elements of a URDF."""
 
-from __future__ import annotations
-
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path

@@ -3,8 +3,6 @@
 The gradient of the depth is that of the visible surface. It has no contribution of silhouettes, where the depth jumps.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Arrays exchanged between compiled programs and the Bullet host, one row per drone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bullet cameras: one on every drone, and a free one for films."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -1,7 +1,5 @@
 """Contact points and forces between bodies."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`make_step` of the Bullet backend."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

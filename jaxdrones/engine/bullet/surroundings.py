@@ -1,7 +1,5 @@
 """Ground and obstacles in a Bullet world."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

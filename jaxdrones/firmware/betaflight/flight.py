@@ -1,7 +1,5 @@
 """Flight of a simulated drone with Betaflight in the loop, in lockstep or in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

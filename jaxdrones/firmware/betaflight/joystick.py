@@ -1,7 +1,5 @@
 """Sticks of a joystick or of a transmitter on USB, by the joystick interface of Linux."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import struct

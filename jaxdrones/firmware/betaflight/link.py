@@ -1,7 +1,5 @@
 """Sockets between a simulator and Betaflight's SITL, on the loopback address."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

@@ -1,7 +1,5 @@
 """MSP, Betaflight's protocol of settings and status, over TCP."""
 
-from __future__ import annotations
-
 import functools
 import operator
 import socket

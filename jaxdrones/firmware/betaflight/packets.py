@@ -4,8 +4,6 @@ The simulator's axes are x forward, y left, z up. Betaflight's gyroscope and acc
 down; its packet has the specific force with the opposite sign.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pilots: from the state of the drone to the sticks."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Process of Betaflight's SITL."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

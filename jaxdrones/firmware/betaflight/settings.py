@@ -1,7 +1,5 @@
 """Settings and status of Betaflight by MSP: switches, rates, direction of the motors, arming."""
 
-from __future__ import annotations
-
 import struct
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Physics of a drone whose motors Betaflight commands."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

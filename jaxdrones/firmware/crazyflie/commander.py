@@ -1,7 +1,5 @@
 """Set-points from the wire: commander and generic commander, and what happens without them."""
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any

@@ -1,7 +1,5 @@
 """Simulated Crazyflie: what it answers to packets, and what it does in 10 ms."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 from collections.abc import Callable, Hashable, Iterator

@@ -1,7 +1,5 @@
 """High-level commander: take-off, landing, positions and trajectories, flown by set-points of its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import struct

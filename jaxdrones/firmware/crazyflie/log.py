@@ -1,7 +1,5 @@
 """Log blocks: groups of variables that are sent periodically."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 from collections.abc import Iterator

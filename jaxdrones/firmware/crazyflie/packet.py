@@ -1,7 +1,5 @@
 """Packets of CRTP, the Crazyflie's protocol: one in each datagram, with a header of one byte."""
 
-from __future__ import annotations
-
 import enum
 from typing import NamedTuple
 

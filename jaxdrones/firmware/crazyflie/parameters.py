@@ -1,7 +1,5 @@
 """Parameters of the vehicle: those of the firmware that act here, and those that scripts ask for."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from typing import NamedTuple

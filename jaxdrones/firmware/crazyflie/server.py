@@ -1,7 +1,5 @@
 """Link of a simulated Crazyflie over UDP, and its flight in real time."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import select

@@ -1,7 +1,5 @@
 """Supervisor: arming, tumbling and emergency stops."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from jaxdrones.firmware.crazyflie.vehicle import Sample

@@ -1,7 +1,5 @@
 """Tables of contents: the parameters and the log variables of the vehicle, with their types."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Log variables of the vehicle, in the firmware's names, units and signs."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple

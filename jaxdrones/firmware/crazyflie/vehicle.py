@@ -1,7 +1,5 @@
 """Simulated Crazyflie: physics and the firmware's PID, 10 ms at a time."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -160,8 +160,7 @@ def hint(name: str, known: Iterable[str]) -> str:
 def check_sequence(name: str, value: Any, example: str) -> tuple:
     """Validated entries of a sequence; an iterator, which can be read only once, is none."""
     if isinstance(value, str | Iterator) or callable(value) or not isinstance(value, Iterable):
-        what = "a single function, " * callable(value) + short_repr(value)
-        raise UserError(f"{name} is {what}; give a sequence, for example ({example},)")
+        raise UserError(f"{name} is {short_repr(value)}; give a sequence, for example ({example},)")
     return tuple(value)
 
 

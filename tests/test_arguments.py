@@ -20,7 +20,7 @@ def flight(
     images: Annotated[tuple[str, ...], choices("image", ("depth", "rgb"), "'depth'")] = (),
     control: Annotated[object, function("jaxdrones.control.pid")] = abs,
     ground: Switch = True,
-    **others: float,
+    **others: Annotated[float, number("m/s", "{argument} of the flight")],
 ) -> float:
     """Height doubled."""
     return 2 * height
@@ -63,6 +63,12 @@ def test_a_wrong_argument_is_named_with_what_to_give(given, message):
         flight(**{"height": 1.0} | given)
 
 
+def test_an_iterator_is_no_sequence():
+    """It could be read only once, by the check or by the function."""
+    with pytest.raises(ValueError, match=r"images is <.*; give a sequence, for example \('depth',\)"):
+        flight(1.0, images=iter(["depth"]))
+
+
 def test_arguments_are_checked_by_position_as_by_name():
     with pytest.raises(ValueError, match="height is -1"):
         flight(-1)
@@ -97,6 +103,8 @@ def test_an_unknown_keyword_names_the_closest_one():
     with pytest.raises(UnexpectedKeyword, match=r"Settings\(\) got an unexpected .* 'world'; did you mean 'worlds'\?"):
         Settings(world=3)
     assert flight(1.0, wind=2.0) == 2.0  # other keywords are welcome
+    with pytest.raises(ValueError, match=r"wind of the flight is nan; give a finite number \(m/s\)"):
+        flight(1.0, wind=float("nan"))
 
 
 def test_signature_and_documentation_remain():

@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import Check, checked, sequence
+from jaxdrones.arguments import checked, sequence
 from jaxdrones.checks import bind, check_function, takes
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
@@ -74,8 +74,11 @@ def of_step(name: str, function: Any) -> None:
         )
 
 
-def _functions(name: str) -> Check:
-    return sequence(_EXAMPLE[name], of_step)
+def _functions(name: str, functions: Any) -> None:
+    if callable(functions):
+        example = f"({_EXAMPLE[name]},)"
+        raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example {example}")
+    sequence(_EXAMPLE[name], of_step)(name, functions)
 
 
 def _model(name: str, model: Any) -> None:
@@ -88,9 +91,9 @@ def _model(name: str, model: Any) -> None:
 class Physics:
     """Effects, models and rotors of a team, shared by both `make_step`."""
 
-    effects: Annotated[Sequence[Effect], _functions("effects")] = ()
-    pairs: Annotated[Sequence[Pair], _functions("pairs")] = ()
-    team_effects: Annotated[Sequence[TeamEffect], _functions("team_effects")] = ()
+    effects: Annotated[Sequence[Effect], _functions] = ()
+    pairs: Annotated[Sequence[Pair], _functions] = ()
+    team_effects: Annotated[Sequence[TeamEffect], _functions] = ()
     models: Annotated[Sequence[Model], sequence("jaxdrones.Model(name, init, rate)", _model)] = ()
     rotors: Annotated[Rotors, of_step] = instant_rotors
     neighbors: NeighborGrid | None = None

@@ -78,7 +78,7 @@ def function(example: str, arguments: tuple[str, ...] | None = None, name: str =
 
 
 def shape(*lengths: int | str, meaning: str, name: str = "", finite: bool = False) -> Range:
-    """Array of this shape, with finite numbers if asked for; a string is any length of at least one."""
+    """Array of this shape, and with `finite` only of finite numbers; a string is any length of at least one."""
     return Range(functools.partial(checks.check_shape, shape=lengths, meaning=meaning, finite=finite), name)
 
 

@@ -81,10 +81,10 @@ def training_options(large_arrays: bool) -> dict[str, Any]:
 def _known(**options: Any) -> dict[str, Any]:
     if jax.default_backend() != "cpu":
         return {}
-    return {name: value for name, value in options.items() if _is_known(name, value)}
+    return {name: value for name, value in options.items() if _is_supported(name, value)}
 
 
-def _is_known(name: str, value: Any) -> bool:
+def _is_supported(name: str, value: Any) -> bool:
     try:
         jax.jit(lambda: 0).lower().compile({name: value})
     except Exception as error:  # of another type in every version

@@ -31,14 +31,14 @@ def _in_all_worlds(worlds: int, batched: list[bool], holds: Array) -> tuple[Arra
 def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | None = None) -> Callable[..., Any]:
     """Build `(needed, *args, otherwise=None) -> function(*args)`, with `otherwise` or zeros where `needed` () is false.
 
-    Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds or of one in `one_in`.
+    Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds, or of all worlds / `one_in`.
     Derivatives are those of the function where it is needed, else those of `otherwise`, and cost as many worlds; in
     reverse mode the function is recomputed.
 
     Args:
         function: pure function of arrays.
-        one_in: all worlds over those of a chunk.
-        chunk: number of worlds of a chunk, in place of `one_in`.
+        one_in: number of chunks that hold all worlds.
+        chunk: worlds in a chunk, in place of `one_in`.
     """
 
     def where(needed: Array, *args: Any, otherwise: Any = None) -> Any:

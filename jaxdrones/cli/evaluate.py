@@ -11,7 +11,7 @@ from jaxdrones.cli.common import DIVERGED, print_error
 from jaxdrones.cli.options import add_backend, add_drones
 from jaxdrones.cli.policies import add_policy, open_policy, policy_of, team_of_run
 from jaxdrones.cli.report import evaluation_table, percent, print_results
-from jaxdrones.cli.settings import asked_settings
+from jaxdrones.cli.settings import given_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.learning import evaluate
@@ -44,7 +44,7 @@ def add(commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    settings = asked_settings(options)
+    settings = given_settings(options)
     team = team_of_run(options, settings)
     run = open_policy(options.policy, options.task, options.realistic, settings, options.last)
     recipe, title, make_policy, place = policy_of(run, options)

@@ -4,7 +4,7 @@ import argparse
 
 from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
 from jaxdrones.cli.report import print_results
-from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
+from jaxdrones.cli.settings import add_realistic, given_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
 
 
@@ -26,7 +26,7 @@ def add(commands) -> None:
 
 
 def _explain(options: argparse.Namespace) -> int:
-    settings = asked_settings(options)
+    settings = given_settings(options)
     with (
         user_mistakes(settings, options.task),
         make(options.task, backend=options.backend, realistic=options.realistic, **settings) as env,

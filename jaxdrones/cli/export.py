@@ -7,7 +7,7 @@ from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
-from jaxdrones.cli.settings import asked_settings
+from jaxdrones.cli.settings import given_settings
 from jaxdrones.export import save
 
 TARGETS = ("c", "onnx", "stablehlo", "js")
@@ -31,7 +31,7 @@ def add(commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
+    run = open_policy(options.policy, options.task, options.realistic, given_settings(options), options.last)
     recipe, title, make_policy, _ = policy_of(run, options)
     own = is_user_policy(options.policy)
     place = run_folder(options.task, "/export") if own else output_folder(options.policy, "export")

@@ -41,7 +41,7 @@ class LiveTraining:
     """Live view of a training: learning curve and an episode of the newest policy after every evaluation."""
 
     def __init__(self, live: Live, trainer: Any, run: Any, what: str, then: Callable[[int, dict[str, float]], None]):
-        """Prepare, without a flight; `what` is the title, and `then` gets the progress afterwards."""
+        """Prepare, without a flight; `what` is the title, and `then` receives the progress afterwards."""
         self._live, self._trainer, self._run, self._what = live, trainer, run, what
         self._then = then
         self._name = "success" if trainer.env.task.success is not None else "return"

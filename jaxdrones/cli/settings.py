@@ -92,7 +92,7 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
     return changes
 
 
-def asked_settings(options: argparse.Namespace) -> dict[str, Any]:
+def given_settings(options: argparse.Namespace) -> dict[str, Any]:
     """Settings of --set, --drones and --vehicle."""
     changes = parse_settings(options.set)
     given = {name: getattr(options, name) for name in ("drones", "vehicle") if getattr(options, name) is not None}

@@ -12,7 +12,7 @@ from typing import Any
 from jaxdrones import arguments
 from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.policies import warn_of_code
-from jaxdrones.cli.settings import asked_settings
+from jaxdrones.cli.settings import given_settings
 from jaxdrones.errors import UserError
 from jaxdrones.learning.loggers import logger_names
 from jaxdrones.limits import LARGEST_COUNT
@@ -41,7 +41,7 @@ class Request(argparse.Namespace):
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
         logger_names(options.log)
         updates, seconds = parse_budget(options.budget)
-        settings = asked_settings(options)
+        settings = given_settings(options)
         if "updates" in settings and options.budget is not None:
             raise UserError(f"--set updates={settings['updates']} is given beside --budget; give one of them")
         settings = settings if updates is None else settings | {"updates": updates}

@@ -87,7 +87,7 @@ def _view_history(options: argparse.Namespace) -> int:
 
 
 def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[str, Any]) -> int:
-    """Write the page and a film if asked to, open the page if asked to, and print what was written."""
+    """Write the page, and with --video a film; open the page with --open, and print what was written."""
     page.save(output)
     files = [output]
     if options.video:

@@ -56,7 +56,7 @@ def rpm(near_hover: float | None = None) -> Action:
 
 
 def throttle() -> Action:
-    """Four rotor speeds over the largest: -1 is standstill, 1 full speed; hover is for the policy to find."""
+    """Four rotor speeds over the largest: -1 is standstill, 1 full speed. The policy has to learn the hover speed."""
     return _rotor_speeds(_ROTORS, lambda params, action: (action + 1) / 2 * params.max_rpm)
 
 

@@ -32,7 +32,7 @@ class Pace:
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated over real time."""
+        """Real-time factor: simulated time over elapsed time."""
         return self.simulated_s / self.real_s if self.real_s else 0.0
 
 

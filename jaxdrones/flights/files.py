@@ -206,7 +206,9 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         )
     motors = [[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]
     if any(len(speeds) != _WIDTHS["rpm"] for team in motors for speeds in team):
-        raise UserError(f"{path}: a message of /motors has not {_WIDTHS['rpm']} numbers; record the rotor speeds, RPM")
+        raise UserError(
+            f"{path}: a message of /motors does not have {_WIDTHS['rpm']} numbers; record the rotor speeds, RPM"
+        )
     odometry = [[found[f"drone_{i}/odom"][ns] for i in range(n)] for ns in times]
 
     def stacked(part: str, kind: str, axes: str) -> np.ndarray:

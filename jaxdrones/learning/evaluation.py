@@ -63,8 +63,8 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: Count = 1000) -> R
 
     Args:
         env: environment of either backend.
-        policy: observations (n, d), or a dictionary with images, -> actions (n, a): a pytree, or any function; or a
-            recurrent policy, see `learning.networks`.
+        policy: function from observations, (n, d) or a dictionary with images, to actions (n, a); a pytree that is
+            called like one; or a recurrent policy, see `learning.networks`.
         key: random key.
         episodes: number of episodes.
 

@@ -18,7 +18,8 @@ def explore(policy: Policy, log_std: Array, noise: Array, hidden_state: Any, obs
     """Actions around those of a policy in many worlds, for `collect.collect`.
 
     `log_std` (a,) or (n, a) is the logarithm of the standard deviation of actions, and the noise (w, n, a) is standard
-    normal. The hidden state is that before the observations (w, n, d), or a dictionary with images.
+    normal. The hidden state is the one before the observations; these are (w, n, d), or a
+    dictionary with images.
 
     Returns:
         The hidden state after the observations, the actions (w, n, a), and their log probability density (w, n).

@@ -97,7 +97,7 @@ def casadi_model(
 
     Raises:
         NotImplementedError: an effect or model with an unsupported JAX primitive.
-        ValueError: an unknown vehicle or parameter, or something else than what `make_derivative` takes.
+        ValueError: an unknown vehicle or parameter, or an argument that `make_derivative` rejects.
     """
     with jax.enable_x64(True):
         loaded = vehicle if isinstance(vehicle, Params) else load_params(vehicle)

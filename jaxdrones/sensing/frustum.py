@@ -162,10 +162,10 @@ def fold(function: Callable[..., Array], start: Array, view: View, solids: Solid
                 at = following[at + 1]
             return at, image
 
-        def goes_on(carry: tuple[Array, Array], size=size) -> Array:
+        def is_unfinished(carry: tuple[Array, Array], size=size) -> Array:
             return carry[0] < size
 
-        _, image = jax.lax.while_loop(goes_on, turn, (following[0], image))
+        _, image = jax.lax.while_loop(is_unfinished, turn, (following[0], image))
         count += size
     return image
 

@@ -83,7 +83,7 @@ def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:
 def read(
     part: ImuPart, key: jax.Array, errors: dict[str, Errors], true: dict[str, Array], dt: float
 ) -> tuple[dict[str, Errors], dict[str, Array]]:
-    """Errors and reading of one measurement of a unit, `dt` (s) after the previous one; `true` is that of `motion`."""
+    """Errors and reading of one measurement of a unit, `dt` (s) after the previous one; `true` is from `motion`."""
     keys = dict(zip(("acc", "gyro"), jax.random.split(key), strict=True))
     result = {name: getattr(part, name).measure(keys[name], errors[name], true[name], dt) for name in keys}
     return {name: result[name][0] for name in keys}, {name: result[name][1] for name in keys}

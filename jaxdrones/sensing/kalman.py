@@ -14,7 +14,7 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import along_z
 
 POS, VEL, ANGLE, GYRO_BIAS, ACC_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5))
-"""The places of the parts of the error, (3,) each."""
+"""Slices of the error state, (3,) each."""
 
 
 class Estimate(PyTreeNode):

@@ -102,7 +102,7 @@ class ObservationTerm:
     """Number of rows of equal length, side by side, of a set whose order has no meaning; 0 for a vector. A row begins
     with a position relative to the drone, m."""
     reach: Annotated[float, arguments.number("m", above=0, infinite=True)] = math.inf
-    """Distance from which on a row has no effect, m."""
+    """Distance beyond which a row has no effect, m."""
 
     def __post_init__(self):
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):

@@ -4,7 +4,7 @@
     state            complete state of the training, to continue bit for bit
     progress.csv     a row for each update
     report.json      evaluation of the best policy, and duration of the training
-    history/         policies of all evaluations, by their update, if asked for
+    history/         policies of all evaluations, by their update, with `keep_history`
 
 Each checkpoint is a .msgpack file with a .json sidecar. All contain the id of their training, and files of different
 trainings in one folder are rejected.

@@ -131,7 +131,7 @@ class Client:
             self.p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], self.id)
 
     def advance(self, team: np.ndarray, loads: np.ndarray) -> np.ndarray:
-        """One physics step of a team (n, 13+) under `loads` (n, 10+), see `arrays`; returns the next (n, 13)."""
+        """Bodies (n, 13) of a team (n, 13+) after one physics step under `loads` (n, 10+); see `arrays` for columns."""
         p, client, world = self.p, self.id, self.p.WORLD_FRAME
         near, before = self._near(team, loads), self._colliding
         given = zip(self.drones, team.tolist(), loads.tolist(), near, before, strict=True)

@@ -100,7 +100,7 @@ def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str,
         limit = re.search(r"python_version (<=?|>=?) ['\"]([\d.]+)['\"]", found["marker"] or "")
         if limit and not _COMPARISONS[limit[1]](_numbers(platform.python_version())[:2], _numbers(limit[2])):
             unavailable.append(f"{found['name']} is for Python {limit[1]} {limit[2]}")
-        elif _version(found["name"]) is None:
+        elif machine.version(found["name"]) == machine.NOT_INSTALLED:
             missing.append(found["name"])
         else:
             wrong += _unfit(found["name"], found["versions"])
@@ -114,8 +114,8 @@ def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str,
 
 def _unfit(name: str, wanted: str) -> list[str]:
     """Problem with the version of a library; empty for a supported one."""
-    found = _version(name)
-    if found is None:
+    found = machine.version(name)
+    if found == machine.NOT_INSTALLED:
         return [f'{name} is not installed; pip install "{name}{wanted}"']
     for limit in filter(None, (part.strip() for part in wanted.split(","))):
         sign = re.match(r"[<>=]+", limit)
@@ -123,13 +123,6 @@ def _unfit(name: str, wanted: str) -> list[str]:
         if not _COMPARISONS[sign[0]](_numbers(found), _numbers(limit[sign.end() :])):
             return [f'{name} is {found}, wanted is {wanted}; pip install "{name}{wanted}"']
     return []
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _numbers(version: str) -> tuple[int, ...]:

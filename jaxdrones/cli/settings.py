@@ -66,15 +66,12 @@ def with_config(arguments: list[str]) -> list[str]:
     options = []
     for name, x in entries.items():
         if isinstance(x, dict):  # set and sweep
-            options += [f"--{name}={key}={_listed(value) if name == 'sweep' else value}" for key, value in x.items()]
+            values = {key: ",".join(map(str, value)) if name == "sweep" else value for key, value in x.items()}
+            options += [f"--{name}={key}={value}" for key, value in values.items()]
         elif x is not False:
             options.append(f"--{name}" if x is True else f"--{name}={x}")
     first = next((k for k in range(command + 1, len(rest)) if rest[k].startswith("-")), len(rest))
     return [*rest[:first], *task, *options, *rest[first:]]
-
-
-def _listed(values: list[Any]) -> str:
-    return ",".join(map(str, values))
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:

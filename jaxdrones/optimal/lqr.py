@@ -12,7 +12,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Weights, check_period, hover, reference
+from jaxdrones.optimal.problem import Weights, check_plan, hover, reference
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -62,7 +62,7 @@ def control(
 
     There is no plan, and so no status: those of a state that is not finite are not finite.
     """
-    check_period(settings.step, dt)
+    check_plan(settings.horizon, setpoints, settings.step, dt)
     target = reference(params, setpoints, state.aux, dt)
     return memory, feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])
 

@@ -154,7 +154,7 @@ class Mpc:
             PlanningError: there is no new plan, and `on_failure` is `raise`.
         """
         n = len(self._kept)
-        check_plan(self.horizon, setpoints, on_failure, params, state)
+        check_plan(self.horizon, setpoints, on_failure=on_failure, given=(params, state))
         if self._is_flyable(state, setpoints):
             self._plan = self._solved(state, setpoints, params)
             self.status = Status.NOT_CONVERGED if self._plan is None else Status.OK

@@ -117,8 +117,7 @@ def posed(
     Raises:
         ValueError: a wrong time between calls, number of setpoints, or `on_failure` for these arguments.
     """
-    check_period(settings.step, dt)
-    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
+    check_plan(settings.horizon, setpoints, settings.step, dt, on_failure, (params, memory, state))
     valid = is_finite((state, setpoints))
     rest = hover(params, state)
     rest = rest.replace(aux=jax.tree.map(jnp.zeros_like, rest.aux))
@@ -128,18 +127,16 @@ def posed(
     return valid, state, reference(params, setpoints, state.aux, dt)
 
 
-def check_plan(horizon: int, setpoints: Setpoint, on_failure: str, *given: Any) -> None:
-    """Raise `ValueError` on a wrong number of setpoints, or for `on_failure="raise"` with traced arguments."""
+def check_plan(
+    horizon: int, setpoints: Setpoint, step: Any = None, dt: float = 0.0, on_failure: str = "hold", given: Any = ()
+) -> None:
+    """Raise on a wrong number of setpoints, a `dt` other than the period of `step`, or `raise` while traced."""
+    period = getattr(step, "period", None)
+    if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
+        raise UserError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")
     check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
     if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves((setpoints, given)))):
         raise UserError(
             "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
             "check the status of the memory"
         )
-
-
-def check_period(step: Any, dt: float) -> None:
-    """Raise `ValueError` unless the time between calls is the step's period, if that is known."""
-    period = getattr(step, "period", None)
-    if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
-        raise UserError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")

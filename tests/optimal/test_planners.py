@@ -117,6 +117,10 @@ def test_setpoints_that_do_not_fit_the_horizon_are_refused():
         memory = jax.eval_shape(functools.partial(module.init, settings), params, state, *keys)
         with pytest.raises(ValueError, match=r"setpoints.pos has shape \(3, 3\); expected \(9, 3\)"):
             module.control(settings, params, memory, state, short, dt=DT)
+    settings = lqr.settings(_step())
+    memory = jax.eval_shape(functools.partial(lqr.init, settings), params, state)
+    with pytest.raises(ValueError, match=r"setpoints.pos has shape \(2, 3\); expected \(3, 3\)"):
+        lqr.control(settings, params, memory, state, Setpoint.at(jnp.zeros((2, 3))), dt=DT)
 
 
 @functools.cache

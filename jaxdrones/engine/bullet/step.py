@@ -156,9 +156,6 @@ class BulletStep(HostStep):
     def _set_scene(self, scene: Scene) -> Scene:
         """Place the bodies of a concrete scene; return the part of it that wrenches depend on."""
         self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
-        return self._acting(scene)
-
-    def _acting(self, scene: Scene) -> Scene:
         return self.physics.seen(scene)
 
     def _place(self, params: Params, state: State) -> np.ndarray:
@@ -188,7 +185,7 @@ class BulletStep(HostStep):
         """Step in a compiled program, which computes the wrenches and calls back for every physics step."""
         bodies, flat_params = arrays.bodies_of(params), pack(params, len(state.pos))
         layout, aux = Layout.of(params), Layout.of(state.aux)
-        team, acting, handed = arrays.one_array(state, rpm), self._acting(scene), self._handed(scene)
+        team, acting, handed = arrays.one_array(state, rpm), self.physics.seen(scene), self._handed(scene)
 
         def advance(bodies, scene, team, loads):
             self._sync_world(bodies, scene)

@@ -4,8 +4,6 @@
 compiled step; the options are those of `jaxdrones.make`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import string
 from collections.abc import Sequence

@@ -10,8 +10,6 @@ obs, state, reward, done, info = env.step(key, state, action, params)
 Gymnax itself is not needed.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """Spaces with samples by JAX, compatible with those of gymnax and JaxMARL."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Protocol
 

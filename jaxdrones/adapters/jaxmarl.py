@@ -9,8 +9,6 @@ obs, state, rewards, dones, infos = env.step(key, state, {agent: action for agen
 JaxMARL itself is not needed.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from typing import Any

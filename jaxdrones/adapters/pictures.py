@@ -1,7 +1,5 @@
 """Pictures of teams from the side, for `render_mode="rgb_array"`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import jax

@@ -1,7 +1,5 @@
 """Episodes of one world on the host, with NumPy arrays and one compiled call per control step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any
 

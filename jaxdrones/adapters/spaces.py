@@ -1,7 +1,5 @@
 """Gymnasium spaces of an environment, and layouts of teams."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Many worlds in one compiled step, with automatic or manual reset."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

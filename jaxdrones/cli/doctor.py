@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from jaxdrones.cli import machine
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError, install
 
 _LEFT_OUT = ("all", "dev", "docs")  # extras of extras, or for developers
@@ -51,7 +51,7 @@ def _doctor(options: argparse.Namespace) -> int:
     sizes = [path.stat().st_size for path in folder.glob("*-cache")]
     result["programs"] = {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
     result |= {"devices": devices, "notes": _notes(devices), "extras": present, "self_test": tests, "wrong": wrong}
-    print(as_json(result) if options.json else _text(result))
+    print_results(options, result, _text(result))
     return 1 if wrong else 0
 
 

@@ -15,7 +15,7 @@ from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_o
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
-from jaxdrones.cli.report import as_json, described, summary, table
+from jaxdrones.cli.report import described, print_results, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -195,18 +195,15 @@ def _report(
 ) -> None:
     """Print the results after a time, s; `end` describes the end of an episode."""
     rows = results.results(record, after)
-    if options.json:
-        about = record.conditions.as_dict() | (end or {})
-        print(as_json(about | {"results": rows, "diverged": diverged, "files": list(map(str, files))}))
-    else:
-        print(record.conditions)
-        print(table(rows if len(rows) <= paths.MOST_NAMED else summary(rows)))
-        print(results.definitions(record, after))
-        if end is not None:
-            how = {True: "success", False: "no success", None: "done"}[end["success"]]
-            why = f"ended by {', '.join(end['ended_by'])}" if end["ended_by"] else "to the end"
-            print(f"{how}: return {end['return']:.1f}, {end['duration']:.2f} s, {why}")
-        print("wrote " + ", ".join(map(str, files)))
+    about = record.conditions.as_dict() | (end or {})
+    about |= {"results": rows, "diverged": diverged, "files": list(map(str, files))}
+    lines = [record.conditions, table(rows if len(rows) <= paths.MOST_NAMED else summary(rows))]
+    lines.append(results.definitions(record, after))
+    if end is not None:
+        how = {True: "success", False: "no success", None: "done"}[end["success"]]
+        why = f"ended by {', '.join(end['ended_by'])}" if end["ended_by"] else "to the end"
+        lines.append(f"{how}: return {end['return']:.1f}, {end['duration']:.2f} s, {why}")
+    print_results(options, about, *lines, "wrote " + ", ".join(map(str, files)))
 
 
 def _check_files(options: argparse.Namespace, output: Path, vehicle: str) -> None:

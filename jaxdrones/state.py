@@ -53,12 +53,12 @@ class State(PyTreeNode):
         return cls(pos, quat, jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 4)))
 
 
-def _team(name: str, state: Any) -> None:
+def _check_team(name: str, state: Any) -> None:
     check_shape(
         f"{name}.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap"
     )
     check_shape(f"{name}.quat", state.quat, (len(state.pos), 4), f"{name}.pos has {len(state.pos)} drones")
 
 
-TeamState = Annotated[State, _team]
+TeamState = Annotated[State, _check_team]
 """State of a team, with poses of every drone."""

@@ -21,7 +21,7 @@ from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, limited
 from jaxdrones.engine.clearance import NearObstacles
 from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.physics import Contact, Physics, Rotors, of_step
+from jaxdrones.engine.physics import Contact, Physics, Rotors, check_function_of_step
 from jaxdrones.engine.step import Step, is_traced
 from jaxdrones.engine.team import check_team
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
@@ -91,7 +91,7 @@ def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
-    integrator: Annotated[Integrator, of_step] = semi_implicit_euler,
+    integrator: Annotated[Integrator, check_function_of_step] = semi_implicit_euler,
     dt: Seconds = 1 / 240,
     substeps: Count = 1,
     *,

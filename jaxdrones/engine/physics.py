@@ -57,7 +57,7 @@ class Loads(NamedTuple):
     aux_rate: dict[str, Any]
 
 
-def of_step(name: str, function: Any) -> None:
+def check_function_of_step(name: str, function: Any) -> None:
     """Raise unless this is a function for the argument `name` of `make_step`."""
     given = bind(function, scene=None) if name == "effects" else function
     check_function(name, given, _ARGUMENTS[name], example=_EXAMPLE[name], hint=_ELSEWHERE.get(name, ""))
@@ -74,14 +74,14 @@ def of_step(name: str, function: Any) -> None:
         )
 
 
-def _functions(name: str, functions: Any) -> None:
+def _check_functions(name: str, functions: Any) -> None:
     if callable(functions):
         example = f"({_EXAMPLE[name]},)"
         raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example {example}")
-    sequence(_EXAMPLE[name], of_step)(name, functions)
+    sequence(_EXAMPLE[name], check_function_of_step)(name, functions)
 
 
-def _model(name: str, model: Any) -> None:
+def _check_model(name: str, model: Any) -> None:
     if not isinstance(model, Model):
         raise UserError(f"{name}: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
 
@@ -91,11 +91,11 @@ def _model(name: str, model: Any) -> None:
 class Physics:
     """Effects, models and rotors of a team, shared by both `make_step`."""
 
-    effects: Annotated[Sequence[Effect], _functions] = ()
-    pairs: Annotated[Sequence[Pair], _functions] = ()
-    team_effects: Annotated[Sequence[TeamEffect], _functions] = ()
-    models: Annotated[Sequence[Model], sequence("jaxdrones.Model(name, init, rate)", _model)] = ()
-    rotors: Annotated[Rotors, of_step] = instant_rotors
+    effects: Annotated[Sequence[Effect], _check_functions] = ()
+    pairs: Annotated[Sequence[Pair], _check_functions] = ()
+    team_effects: Annotated[Sequence[TeamEffect], _check_functions] = ()
+    models: Annotated[Sequence[Model], sequence("jaxdrones.Model(name, init, rate)", _check_model)] = ()
+    rotors: Annotated[Rotors, check_function_of_step] = instant_rotors
     neighbors: NeighborGrid | None = None
 
     def __post_init__(self):

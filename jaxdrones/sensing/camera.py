@@ -159,9 +159,9 @@ camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), off
 corners of the pixels in place of their centers."""
 
 
-def _camera(name: str, camera: Any) -> None:
+def _check_camera(name: str, camera: Any) -> None:
     if not isinstance(camera, Camera):
         raise UserError(f"{name} is {short_repr(camera)}; give for example jaxdrones.Camera(resolution=(16, 12))")
 
 
-OneCamera = Annotated[Camera, _camera]
+OneCamera = Annotated[Camera, _check_camera]

@@ -42,7 +42,7 @@ class Images(PyTreeNode):
 
 
 _DEFAULT = Camera()
-_Point = Annotated[ArrayLike, shape(3, meaning="m, world")]
+_POINT = shape(3, meaning="m, world")
 
 
 @checked
@@ -88,8 +88,8 @@ def view(
     scene: AnalyticScene,
     params: Params,
     state: TeamState,
-    eye: _Point,
-    target: _Point,
+    eye: Annotated[ArrayLike, _POINT],
+    target: Annotated[ArrayLike, _POINT],
     camera: OneCamera = _DEFAULT,
     colors: Float[ArrayLike, "n 3"] | None = None,
 ) -> Images:

@@ -32,11 +32,13 @@ _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _NEAREST_FLOW = 0.08  # m: the PMW3901 is out of focus below
 
 
-_Vector = Annotated[ArrayLike, shape(3, meaning="x, y, z of one ray; for many use jax.vmap")]
+_VECTOR = shape(3, meaning="x, y, z of one ray; for many use jax.vmap")
 
 
 @checked
-def ray(scene: AnalyticScene, origin: _Vector, direction: _Vector) -> Float[Array, ""]:
+def ray(
+    scene: AnalyticScene, origin: Annotated[ArrayLike, _VECTOR], direction: Annotated[ArrayLike, _VECTOR]
+) -> Float[Array, ""]:
     """Distance along a ray to the first surface of a scene, m; zero where it starts inside.
 
     It is differentiable in the ray and in the scene.

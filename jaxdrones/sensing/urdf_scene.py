@@ -22,15 +22,14 @@ _ORIGIN: Pose = (np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 _NAME = "{argument} of the root link"
-_Pos = Annotated[ArrayLike, shape(3, meaning="of one link", name=_NAME, finite=True)]
-_Quat = Annotated[ArrayLike, shape(4, meaning="of one link", name=_NAME, finite=True), quaternion(_NAME)]
+_POS, _QUAT = (shape(length, meaning="of one link", name=_NAME, finite=True) for length in (3, 4))
 
 
 @checked
 def from_urdf(
     path: str | os.PathLike,
-    pos: _Pos = (0.0, 0.0, 0.0),
-    quat: _Quat = (0.0, 0.0, 0.0, 1.0),
+    pos: Annotated[ArrayLike, _POS] = (0.0, 0.0, 0.0),
+    quat: Annotated[ArrayLike, _QUAT, quaternion(_NAME)] = (0.0, 0.0, 0.0, 1.0),
     ground: bool = True,
 ) -> Scene:
     """Load the boxes, spheres, cylinders and capsules of a URDF as static obstacles.

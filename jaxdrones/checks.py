@@ -49,6 +49,8 @@ def short_repr(value: Any) -> str:
 
 def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str, *, finite: bool = False) -> None:
     """Raise unless `array` has `shape`, and finite numbers; a string entry is any length of at least one."""
+    if isinstance(array, list | tuple):  # of numbers, some of which may be traced
+        array = (np if all(map(is_concrete, jax.tree.leaves(array))) else jnp).asarray(array)
     given = np.shape(array)
     fits = len(given) == len(shape) and all(
         n >= 1 if isinstance(wanted, str) else n == wanted for n, wanted in zip(given, shape, strict=True)

@@ -28,6 +28,11 @@ def test_worlds_of_teams_at_rest_come_from_vmap():
     np.testing.assert_array_equal(worlds.pos, pos)
 
 
+def test_a_traced_height_may_stand_among_numbers():
+    heights = jax.jit(lambda z: State.at_rest([[0, 0, z], [1, 0, 2.0]]).pos[:, 2])(1.5)
+    np.testing.assert_array_equal(heights, [1.5, 2])
+
+
 @pytest.mark.parametrize(
     ("pos", "yaw", "message"),
     [

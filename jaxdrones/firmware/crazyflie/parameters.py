@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,8 @@ GAINS = {
     for i, axis in enumerate(axes)
 }
 """Parameter of a gain -> field of `Gains` and axis."""
-_THRUSTS = {"posCtlPid.thrustBase": "base_thrust", "posCtlPid.thrustMin": "min_thrust"}
+_THRUSTS = {"posCtlPid.thrustBase": ("base_thrust", ()), "posCtlPid.thrustMin": ("min_thrust", ())}
+_FIELDS: dict[str, tuple[str, Any]] = GAINS | _THRUSTS
 
 
 class Parameter(NamedTuple):
@@ -66,7 +67,7 @@ def _parameters(gains: Gains) -> dict[str, Parameter]:
 
 
 def _gain(gains: Gains, name: str) -> float:
-    field, i = GAINS[name] if name in GAINS else (_THRUSTS[name], ())
+    field, i = _FIELDS[name]
     return float(np.asarray(getattr(gains, field))[i])
 
 
@@ -115,8 +116,8 @@ class Parameters:
         if not np.isfinite(value):
             return ENOENT
         self.values[name] = value
-        if name in GAINS or name in _THRUSTS:
-            field, i = GAINS[name] if name in GAINS else (_THRUSTS[name], ())
+        if name in _FIELDS:
+            field, i = _FIELDS[name]
             new = np.array(getattr(self._gains, field))
             new[i] = value
             self._gains = self._gains.replace(**{field: new})

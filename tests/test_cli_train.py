@@ -44,7 +44,8 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert run.policy("last").network.hidden_sizes == (8,)
     assert run.recipe().config.worlds == 4 and run.recipe().options == {"duration": 0.2}
     rows = run.history()
-    assert [row["update"] for row in rows] == [1, 2, 3, 4]
+    assert [row["update"] for row in rows] == [0, 1, 2, 3, 4]
+    assert "evaluated_return" in rows[0] and "reward" not in rows[0] and rows[0]["steps"] == 0
     assert rows[-1]["steps"] == 4 * 4 * 4 and "evaluated_return" in rows[-1] and rows[-1]["seconds"] > 0
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
     (report,) = printed["seeds"]
@@ -58,7 +59,7 @@ def test_a_logger_of_the_command_line_gets_every_update(monkeypatch, tmp_path):
     logged = []
     monkeypatch.setattr(loggers.TensorBoard, "__call__", lambda self, update, metrics, state: logged.append(update))
     assert main([*TRAIN, "--no-figure", "--json", "--log", "tensorboard", "--output", str(tmp_path)]) == 0
-    assert logged == [1, 2, 3, 4] and list(tmp_path.glob("events.out.tfevents.*"))
+    assert logged == [0, 1, 2, 3, 4] and list(tmp_path.glob("events.out.tfevents.*"))
 
 
 @pytest.mark.slow
@@ -165,7 +166,7 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
     after = contents(folder)
     assert after["notes.txt"] == b"of other people" and after["best.msgpack"] != before["best.msgpack"]
     assert Run(folder).sidecar_entry("state", "seed") == 5 and Run(folder).report()["updates"] == 4
-    assert [row["update"] for row in Run(folder).history()] == [1, 2, 3, 4]
+    assert [row["update"] for row in Run(folder).history()] == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.slow
@@ -214,7 +215,7 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
 
 
 def rewards(folder):
-    return [row["reward"] for row in Run(folder).history()]
+    return [row["reward"] for row in Run(folder).history()[1:]]
 
 
 def at_least(score, before):
@@ -245,7 +246,7 @@ def test_gradients_that_are_not_finite_stop_training_though_nothing_else_shows_t
     assert "training diverged: gradients were not finite in 4 updates in a row" in said and said.count("\n") == 1
     assert "best.msgpack is the best policy" in said
     assert main([*TRAIN, "--no-figure", "--overwrite", "--output", str(tmp_path)]) == 0
-    assert all(row["nonfinite_gradients"] == 0 for row in Run(tmp_path).history())
+    assert all(row["nonfinite_gradients"] == 0 for row in Run(tmp_path).history()[1:])
 
 
 @pytest.mark.slow
@@ -276,7 +277,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
     for horizon in (2, 4):
         run = Run(tmp_path / "run" / f"horizon={horizon}")
         assert run.recipe().config.horizon == horizon and run.recipe().config.hidden_sizes == (8,)
-        assert [row["update"] for row in run.history()] == [1]
+        assert [row["update"] for row in run.history()] == [0, 1]
     assert "hover by bptt, duration 0.2, horizon=2: 4 worlds x 2 control steps" in capsys.readouterr().out
     assert main(command) == 2 and "horizon=2 holds a finished training" in capsys.readouterr().err
 

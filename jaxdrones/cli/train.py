@@ -50,7 +50,7 @@ def add(commands) -> None:
         "The command writes these files:\n\n"
         "  best, last     policies, each a .msgpack and a .json\n"
         "  state          complete state of the training, for --resume\n"
-        "  progress.csv   a row for each update\n"
+        "  progress.csv   a row for the untrained policy and for each update\n"
         "  curve.png      learning curves\n"
         "  report.json    evaluation of the best policy, and duration of the training\n"
         "  history        policies of all evaluations, with --keep-history\n\n"

@@ -92,21 +92,24 @@ class ProgressDisplay(contextlib.ExitStack):
         if not self._started:
             self._started = True
             self._bar = self.enter_context(bar(self._total, self._what, "update", initial=count))
-        speed = _speed(now["steps_per_s"])
+        speed = _speed(now["steps_per_s"]) if "steps_per_s" in now else ""
         if "evaluated_return" in now:
             self._evaluated = f"return {now['evaluated_return']:.1f}"
             if "success" in now:
                 self._evaluated += f", success {percent(now['success'], self._episodes)}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: update {count:4}{of}  {self._evaluated}, "
-            line += f"median error {now['evaluated_error']:.3f} m, {speed}, {now['seconds']:.1f} s"
+            line += ", ".join(
+                filter(None, (f"median error {now['evaluated_error']:.3f} m", speed, f"{now['seconds']:.1f} s"))
+            )
             if self._bar is None or self._bar.disable:
                 self._print_line(line)
             else:
                 self._bar.write(line, file=sys.stderr if self._print_line is quiet else sys.stdout)
         if self._bar is not None:
             self._bar.update(count - self._bar.n)
-            newest = (self._evaluated, _training_return(now), f"reward {now['reward']:.3f}", speed)
+            reward = f"reward {now['reward']:.3f}" if "reward" in now else ""
+            newest = (self._evaluated, _training_return(now), reward, speed)
             self._bar.set_postfix_str(", ".join(filter(None, newest)))
 
 

@@ -72,7 +72,6 @@ def train(
     try:
         loop = _Loop(trainer, run, seed, deadline, keep_history)
         run.remove_report()
-        loop.save()
         try:
             loop.run_updates(on_progress, loggers)
         except KeyboardInterrupt:
@@ -111,6 +110,7 @@ class _Loop:
         self.highest_success = 0.0
         self.reached = 0  # latest consecutive evaluations with the success rate to stop at
         self.seconds, self.update = 0.0, 0
+        self.first: list[dict[str, float]] = []  # row of progress of the untrained policy
         self.plan: TimePlan | None = None
         if run.started:
             self.state = sharding.shard_state(trainer.mesh, _load(trainer, run))
@@ -121,14 +121,20 @@ class _Loop:
             self.last_evaluation_seconds = about["evaluation_seconds"]
         else:
             self.id, self.state = secrets.token_hex(8), trainer.start(self.key)
-            self.evaluate(self.state.policy, 0)
+            results = self.evaluate(self.state.policy, 0)
+            self.first = [{"update": 0, "steps": 0, "seconds": 0.0, **results}]
         if deadline is not None:
             self.plan = TimePlan(deadline, self.update, self._evaluations, self.last_evaluation_seconds)
             self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
 
     def run_updates(self, on_progress: OnProgress, loggers: Sequence[Callback]) -> None:
         saved, length = self.seconds, 1
-        with Progress(self.run, self._columns(), self.update, loggers) as progress:
+        begin = self.update if not self.first else None
+        with Progress(self.run, self._columns(), begin, loggers) as progress:
+            progress.add(self.first)
+            self.save()
+            for row in self.first:
+                on_progress(0, row)
             while self.update < self.updates:
                 length = min(length, self._next_evaluation() - self.update, MAX_CALL)
                 state, rows, seconds = self.advance(length)

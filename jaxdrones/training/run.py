@@ -2,7 +2,7 @@
 
     best, last       policies: the best one in an evaluation, and the newest
     state            complete state of the training, to continue bit for bit
-    progress.csv     a row for each update
+    progress.csv     a row for the untrained policy and for each update
     report.json      evaluation of the best policy, and duration of the training
     history/         policies of all evaluations, by their update, with `keep_history`
 
@@ -191,9 +191,11 @@ class Run:
 class Progress(contextlib.AbstractContextManager["Progress"]):
     """Writer of progress.csv of a run, and of the same rows to loggers."""
 
-    def __init__(self, run: Run, columns: Sequence[str], update: int, loggers: Sequence[Callable[..., Any]] = ()):
-        """Continue after an update; rows of later updates are dropped."""
-        rows = [row for row in run.history() if row["update"] <= update] if update else []
+    def __init__(
+        self, run: Run, columns: Sequence[str], update: int | None, loggers: Sequence[Callable[..., Any]] = ()
+    ):
+        """Continue after an update, and drop the rows of later ones; begin with `None`."""
+        rows = [row for row in run.history() if row["update"] <= update] if update is not None else []
         self._columns, self._loggers, path = columns, loggers, run.folder / "progress.csv"
         with writing.replaced(path) as new, new.open("w", newline="") as file:
             csv.DictWriter(file, columns).writeheader()

@@ -13,10 +13,18 @@ PANELS = {
     "reward": "reward per step, in training",
     "evaluated_return": "return of an episode, evaluated",
     "success": "success, evaluated",
-    "evaluated_error": "median error in the end (m), evaluated",
+    "evaluated_error": "median final error (m), evaluated",
 }
 _MEDIAN, _BAND = COLORS[-1], "#b4bac1"
-_STAR: dict[str, Any] = {"marker": "*", "markersize": 18, "color": "#f2b705", "markeredgecolor": "black", "zorder": 5}
+_STAR: dict[str, Any] = {
+    "marker": "*",
+    "markersize": 18,
+    "color": "#f2b705",
+    "markeredgecolor": "black",
+    "zorder": 5,
+    "clip_on": False,
+}
+_INTERVAL: dict[str, Any] = {"linestyle": "none", "ecolor": _MEDIAN, "elinewidth": 1.2, "capsize": 5, "capthick": 1.2}
 _GRID = 400
 _MOST_NAMED = 7  # runs with their own lines and names
 
@@ -31,14 +39,14 @@ def save_curves(
     """Draw learning curves over the number of control steps.
 
     Each run is a line. Several runs also have their median, and a band from lowest to highest. The success rate of a
-    single run has its confidence interval. A star marks the evaluation of the best policy of each run.
+    single run has error bars of its confidence intervals. A star marks the evaluation of the best policy of each run.
 
     Args:
         histories: label -> rows of progress.csv, from `training.run.Run.history`.
         path: path of the picture.
         title: title of the figure.
         interval: function for the 95 % interval of a success rate; by default none is drawn.
-        kept: label -> update of the best policy; an untrained one has no star.
+        kept: label -> update of the best policy.
     """
     from matplotlib.ticker import EngFormatter
 
@@ -49,15 +57,16 @@ def save_curves(
             _draw_runs(axis, curves, list(histories))
             if name != "reward":
                 for run in curves:
-                    axis.plot(*_points(_rows_of(histories, kept, run), name).T, linestyle="none", **_STAR)
+                    for point in _points(_rows_of(histories, kept, run), name):
+                        axis.plot(*point, linestyle="none", **_STAR)
             if len(curves) > 1:
                 steps, median, lowest, highest = spread(list(curves.values()))
                 axis.fill_between(steps, lowest, highest, color=_BAND, alpha=0.5, linewidth=0)
                 axis.plot(steps, median, color=_MEDIAN, linewidth=2.6)
             elif curves and name == "success" and interval is not None:
                 points = next(iter(curves.values()))
-                intervals = np.transpose([interval(success) for success in points[:, 1]])
-                axis.fill_between(points[:, 0], *intervals, color=_BAND, alpha=0.5, linewidth=0)
+                low, high = np.transpose([interval(success) for success in points[:, 1]])
+                axis.errorbar(*points.T, np.abs([points[:, 1] - low, high - points[:, 1]]), **_INTERVAL)
             if name == "evaluated_error" and curves and min(points[:, 1].min() for points in curves.values()) > 0:
                 axis.set_yscale("log")
                 axis.yaxis.set_major_formatter("{x:g}")
@@ -72,8 +81,8 @@ def save_curves(
             axis.set_xlabel("control steps flown")
             axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
         figure.suptitle(title + "\n")
-        starred = any(_rows_of(histories, kept, run) for run in histories)
-        handles = _handles(list(histories), interval is not None, starred)
+        best = [row for run in histories for row in _rows_of(histories, kept, run)]
+        handles = _handles(list(histories), interval, best)
         if handles:
             figure.legend(handles=handles, loc="outside lower center", ncols=6)
         style.save(figure, path)
@@ -113,7 +122,7 @@ def _draw_runs(axis: Any, curves: Mapping[str, np.ndarray], names: Sequence[str]
 def _rows_of(
     histories: Mapping[str, Sequence[Mapping[str, float]]], kept: Mapping[str, int] | None, run: str
 ) -> list[Mapping[str, float]]:
-    """Row of the best policy of a run; none for an untrained one."""
+    """Row of the best policy of a run."""
     return [row for row in histories[run] if kept and "update" in row and row["update"] == kept.get(run)]
 
 
@@ -121,17 +130,26 @@ def _tints(runs: int) -> tuple[str, ...]:
     return colors(runs) if runs <= _MOST_NAMED else (_BAND,) * runs
 
 
-def _handles(names: Sequence[str], has_interval: bool, starred: bool) -> list[Any]:
-    """Lines of the legend."""
+def _handles(
+    names: Sequence[str],
+    interval: Callable[[float], tuple[float, float]] | None,
+    best: Sequence[Mapping[str, float]],
+) -> list[Any]:
+    """Entries of the legend, with the interval of the best policy of a single run in numbers."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    def band(label: str) -> Any:
-        return Patch(facecolor=_BAND, alpha=0.5, label=label)
-
-    star = [Line2D([], [], linestyle="none", label="policy that is kept", **_STAR)] * starred
+    star = [Line2D([], [], linestyle="none", label="best policy", **_STAR)] * bool(best)
     if len(names) == 1:
-        return [band("95 % interval")] * has_interval + star
+        if interval is None:
+            return star
+        text = "95 % interval"
+        if best and "success" in best[0]:
+            low, high = interval(best[0]["success"])
+            text += f", of the best policy {100 * low:.1f} to {100 * high:.1f} %"
+        bar = Line2D([], [], color=_MEDIAN, linestyle="none", marker="$\u2336$", markersize=12, label=text)
+        return [bar, *star]
     runs = [Line2D([], [], color=tint, label=name) for tint, name in zip(_tints(len(names)), names, strict=True)]
     median = Line2D([], [], color=_MEDIAN, linewidth=2.6, label=f"median of {len(names)}")
-    return [*(runs if len(names) <= _MOST_NAMED else []), median, band("lowest to highest"), *star]
+    band = Patch(facecolor=_BAND, alpha=0.5, label="lowest to highest")
+    return [*(runs if len(names) <= _MOST_NAMED else []), median, band, *star]

@@ -68,7 +68,7 @@ def test_a_training_that_is_killed_twice_has_the_numbers_of_one_that_was_not(tra
             file.write("1,2")  # the first bytes of a row that was being written
     loop.train(trainer, run, 3, lambda *_: None)
     assert numbers(run) == numbers(whole)
-    assert [row["update"] for row in run.history()] == [1, 2, 3, 4, 5, 6]
+    assert [row["update"] for row in run.history()] == [0, 1, 2, 3, 4, 5, 6]
 
 
 def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole, tmp_path, monkeypatch):
@@ -85,7 +85,7 @@ def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole,
     with pytest.raises(Killed):
         loop.train(trainer, run, 3, lambda *_: None)
     monkeypatch.undo()
-    assert len(run.history()) == 3 and run.sidecar("state")["update"] == 2
+    assert len(run.history()) == 4 and run.sidecar("state")["update"] == 2
     loop.train(trainer, run, 3, lambda *_: None)
     assert numbers(run) == numbers(whole)
 
@@ -119,7 +119,7 @@ def test_a_training_stops_after_three_evaluations_in_a_row_that_reach_its_rate(r
     monkeypatch.setattr(trainer, "recipe", dataclasses.replace(trainer.recipe, stop_at=rate))
     run = Run(tmp_path)
     with pytest.raises(Killed):
-        loop.train(trainer, run, 3, killed_at(4))  # after the evaluation of update 4
+        loop.train(trainer, run, 3, killed_at(5))  # after the evaluation of update 4
     assert run.sidecar("state")["reached"] == (2 if rate == 0.3 else 0)
     loop.train(trainer, run, 3, lambda *_: None)
     assert run.report()["updates"] == run.sidecar("state")["recipe"]["config"]["updates"] == (5 if rate == 0.3 else 6)

@@ -11,10 +11,12 @@ from jaxdrones.visualization.learning_curves import save_curves, spread
 def history(seed, updates=12):
     random = np.random.default_rng(seed)
     rows = []
-    for update in range(1, updates + 1):
-        row = {"update": float(update), "steps": 1000.0 * update, "reward": float(random.normal())}
+    for update in range(updates + 1):
+        row = {"update": float(update), "steps": 1000.0 * update}
+        if update:
+            row["reward"] = float(random.normal())
         if update % 3 == 0:
-            row |= {"evaluated_return": 10.0 * update, "success": update / updates, "evaluated_error": 1 / update}
+            row |= {"evaluated_return": 10.0 * update, "success": update / updates, "evaluated_error": 1 / (1 + update)}
         rows.append(row)
     return rows
 
@@ -52,14 +54,36 @@ def test_a_run_that_was_never_evaluated_is_drawn(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 1000
 
 
-def test_the_policy_that_is_kept_is_marked_where_it_was_evaluated(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(learning_curves.style, "save", lambda figure, path: drawn.append(figure))
+@pytest.fixture
+def drawn(monkeypatch):
+    """Figures in place of their files."""
+    figures = []
+    monkeypatch.setattr(learning_curves.style, "save", lambda figure, path: figures.append(figure))
+    return figures
+
+
+def test_the_best_policy_is_marked_where_it_was_evaluated(drawn, tmp_path):
     save_curves({"a": history(0), "b": history(1)}, tmp_path / "curve.png", "", kept={"a": 6, "b": 0})
     (figure,) = drawn
     stars = [[line.get_xydata().tolist() for line in axis.lines if line.get_marker() == "*"] for axis in figure.axes]
-    assert [[x for x in axis if x] for axis in stars] == [[], [[[6000, 60]]], [[[6000, 0.5]]], [[[6000, 1 / 6]]]]
-    assert "policy that is kept" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert stars == [[], *([[[6000, kept]], [[0, untrained]]] for kept, untrained in ((60, 0), (0.5, 0), (1 / 7, 1)))]
+    assert "best policy" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_success_rates_have_error_bars_of_their_intervals_also_before_training(drawn, tmp_path):
+    def interval(success):
+        return 0.9 * success, min(1.0, success + 0.125)
+
+    save_curves({"a": history(0)}, tmp_path / "curve.png", "", interval, {"a": 12})
+    (figure,) = drawn
+    (bars,) = figure.axes[2].containers
+    (lines,) = bars.lines[2]
+    assert [segment.tolist() for segment in lines.get_segments()] == [
+        [[1000 * update, interval(update / 12)[0]], [1000 * update, interval(update / 12)[1]]]
+        for update in (0, 3, 6, 9, 12)
+    ]
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts == ["95 % interval, of the best policy 90.0 to 100.0 %", "best policy"]
 
 
 def test_a_figure_that_cannot_be_drawn_leaves_the_old_one(tmp_path):

@@ -21,7 +21,7 @@ STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3}
 """Arrays of the state and their widths."""
 PERIOD = 0.01
 """Time between the rows of a log prepared for identification, s."""
-OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0}
+OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0, "load_pos": 3}
 """Optional arrays and their widths; 0 for a number per drone."""
 
 _TAKE_OFF = slice(150, 350)  # rows after the motors start, for the mean voltage at take-off
@@ -88,6 +88,8 @@ class FlightLog:
     """(K, n, 3) commanded velocity, m/s, world."""
     target_yaw: np.ndarray = dataclasses.field(default_factory=_unknown)
     """(K, n) commanded heading, rad."""
+    load_pos: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n, 3) position of the load on the cable of each drone, m, world."""
     labels: tuple[str, ...] = ()
     """Names of the n drones."""
     conditions: Any = dataclasses.field(default_factory=lambda: LoggedConditions({}, ""))

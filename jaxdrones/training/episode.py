@@ -19,7 +19,7 @@ from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.visualization.viewer.show import records_of, refuse
+from jaxdrones.visualization.viewer.show import loads_of, records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
 """(hidden_state, observations) -> (hidden_state, actions)"""
@@ -58,6 +58,7 @@ def to_record(log: EpisodeLog, conditions: LoggedConditions) -> FlightLog:
         **{name: getattr(drones, name) for name in _LOGGED},
         t=log.t,
         target_pos=log.target,
+        load_pos=np.asarray(np.nan) if loads_of(drones) is None else loads_of(drones),
         conditions=conditions,
         params=log.params,
         scene=log.scene,

@@ -16,12 +16,14 @@ from helpers import flying
 
 import jaxdrones as jd
 from jaxdrones.cli import main
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.flights import read_log, save_npz
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
 from jaxdrones.visualization.viewer import show
 from jaxdrones.visualization.viewer.payload import decode
+from jaxdrones.visualization.viewer.show import records_of
 
 ARRAYS = ("pos", "quat", "vel", "omega", "rpm")
 SCENE = Scene.of(
@@ -265,3 +267,18 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
         assert main(["view", str(tmp_path / "one"), *(str(tmp_path / x) for x in others), *page]) == 2
         assert message in capsys.readouterr().err
     assert main(["view", *skipped, *page]) == 2 and "is a flight" in capsys.readouterr().err
+
+
+def test_loads_on_cables_are_in_the_page_and_in_a_log(team, tmp_path):
+    path = trajectory(team)
+    load = PointMass(path.pos - np.array([0.1, 0.0, 0.5]), path.vel)
+    carried = path.replace(aux={"payload": load})
+    world = header(show(carried, team, dt=0.01))["worlds"][0]
+    np.testing.assert_allclose(world["loads"], load.pos, rtol=0, atol=1e-4)
+    assert header(show(path, team, dt=0.01))["worlds"][0]["loads"] is None
+    many = jax.tree.map(lambda x: np.stack([x, x + 1]), carried)
+    second = header(show(many, team, dt=0.01))["worlds"][1]
+    np.testing.assert_allclose(second["loads"], load.pos + 1, rtol=0, atol=1e-4)
+    (record,) = records_of(carried, {"params": team, "dt": 0.01, "targets": None, "labels": None, "images": None})
+    save_npz(record, tmp_path / "log.npz")
+    np.testing.assert_array_equal(read_log(tmp_path / "log.npz").load_pos, load.pos)

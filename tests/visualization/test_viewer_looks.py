@@ -10,7 +10,9 @@ import pytest
 from PIL import Image
 
 import jaxdrones as jd
+from jaxdrones.dynamics.contact import rim
 from jaxdrones.dynamics.interaction import _jet
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.sensing import Cylinder, Scene
 from jaxdrones.visualization import browser
 from jaxdrones.visualization.viewer import show
@@ -218,3 +220,24 @@ def test_vectors_along_a_path_are_arrows_whose_lengths_are_in_proportion(view):
     assert "vectors along the path" in tab.run("document.getElementById('legend').textContent")
     with pytest.raises(ValueError, match=r"arrows have shape \(2, 3\)"):
         show(flight, jd.repeat(jd.load_params("cf2x"), 2), dt=0.1, arrows=np.zeros((2, 3)))
+
+
+def test_a_load_hangs_where_the_log_says_and_a_contact_force_carries_a_drone(view):
+    params = jd.repeat(jd.load_params("cf2x"), 2)
+    low = float(rim(jd.load_params("cf2x"))[0] - params.collision_offset[0])
+    state = at_rest([[0.0, 0.0, low], [1.0, 0.0, 1.0]])
+    load = state.pos + jnp.array([[[0.3, 0.0, -0.4]]])
+    state = state.replace(aux={"payload": PointMass(load, state.vel)})
+    tab = view(show(state, params, dt=0.1))
+    tab.run("document.getElementById('wrench').click(); jaxdrones.player.draw(0)")
+    matrices = "[...jaxdrones.player.%s.mesh.instanceMatrix.array]"
+    loads, cables, contacts = (
+        np.reshape(tab.run(matrices % name), (2, 4, 4))
+        for name in ("loads[0].loads", "loads[0].cables", "arrows[0].contact")
+    )
+    np.testing.assert_allclose(loads[:, 3, :3], load[0], atol=1e-4)
+    np.testing.assert_allclose(cables[:, 2, :3], np.broadcast_to([0.3, 0.0, -0.4], (2, 3)), atol=1e-4)
+    assert contacts[0, 2, 2] > 0 and not contacts[1].any(
+        where=np.eye(4) < 1
+    )  # upwards from the ground; none in the air
+    assert "contact force" in tab.run("document.getElementById('legend').textContent")

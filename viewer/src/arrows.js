@@ -1,4 +1,4 @@
-// Arrows of the rotors' thrusts and of the resultant force and torque, and the marks of the targets.
+// Arrows of the rotors' thrusts, of the resultant force and torque and of contact forces, and the marks of the targets.
 
 import {
   ConeGeometry, CylinderGeometry, DynamicDrawUsage, InstancedMesh, Matrix4, MeshBasicMaterial, OctahedronGeometry, Quaternion, Color, Vector3,
@@ -8,9 +8,9 @@ import { armOf, scratch } from "./flight.js";
 
 const NOWHERE = new Matrix4().makeScale(0, 0, 0);
 const UP = new Vector3(0, 0, 1);
-export const THRUST = "#e69f00", FORCE = "#d55e00", TORQUE = "#0072b2";
+export const THRUST = "#e69f00", FORCE = "#d55e00", TORQUE = "#0072b2", CONTACT = "#009e73";
 const THRUST_ARMS = 1.6; // length of the arrow of a rotor that carries its quarter of the weight, arms
-const FORCE_ARMS = 3; // of a resultant force that equals the weight
+const FORCE_ARMS = 3; // of a resultant or contact force that equals the weight
 const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 
 /** Instances that are set anew in every frame. */
@@ -32,6 +32,11 @@ export class Marks {
     if (!(length > 1e-6) || !Number.isFinite(length)) return this.mesh.setMatrixAt(k, NOWHERE);
     this.turn.setFromUnitVectors(UP, this.along.copy(vector).normalize());
     this.mesh.setMatrixAt(k, this.matrix.compose(from, this.turn, this.size.set(width, width, length)));
+  }
+
+  /** A sphere about a point, of this radius, m. */
+  sphere(k, center, radius) {
+    this.mesh.setMatrixAt(k, this.matrix.compose(center, this.turn.identity(), this.size.setScalar(radius)));
   }
 
   done(visible) {
@@ -56,6 +61,7 @@ export class Arrows {
     this.thrust = new Marks(stage, arrowShape(), arrowMaterial(THRUST), 4 * world.n);
     this.force = new Marks(stage, arrowShape(), arrowMaterial(FORCE), world.n);
     this.torque = new Marks(stage, arrowShape(), arrowMaterial(TORQUE), world.n);
+    this.contact = new Marks(stage, arrowShape(), arrowMaterial(CONTACT), world.n);
     this.targets = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial({ wireframe: true }), world.n);
     world.labels.forEach((_, i) => this.targets.mesh.setColorAt(i, new Color(colors(i))));
   }
@@ -79,6 +85,9 @@ export class Arrows {
       if (wrench) {
         world.force(row, i, v);
         this.force.arrow(i, p, v, there ? (FORCE_ARMS * arm * v.length()) / weight : 0, 0.13 * arm);
+        if (world.contacts) v.fromArray(world.contacts, 3 * (row * world.n + i));
+        else v.set(0, 0, 0);
+        this.contact.arrow(i, p, v, there ? (FORCE_ARMS * arm * v.length()) / weight : 0, 0.13 * arm);
         world.torque(row, i, w).applyQuaternion(q);
         this.torque.arrow(i, p, w, there ? (TORQUE_ARMS * arm * w.length()) / (0.01 * weight * this.arms[i]) : 0, 0.13 * arm);
       }
@@ -90,6 +99,7 @@ export class Arrows {
     this.thrust.done(thrust);
     this.force.done(wrench);
     this.torque.done(wrench);
+    this.contact.done(wrench);
     this.targets.done(targets);
   }
 }

@@ -5,7 +5,7 @@ import { extent } from "./solids.js";
 
 const HUGE = 1e6; // m; a drone that is further away, or nowhere, is not shown
 const SAMPLES = 3000; // positions that the camera is fitted to
-const SIZES = { pos: 3, quat: 4, vel: 3, omega: 3, rpm: 4, targets: 3, target_vel: 3 }; // numbers per drone and row
+const SIZES = { pos: 3, quat: 4, vel: 3, omega: 3, rpm: 4, targets: 3, target_vel: 3, loads: 3 }; // numbers per drone and row
 
 /** Largest horizontal distance of a rotor from the center of mass, m. */
 export const armOf = (vehicle) => Math.max(...vehicle.rotor_pos.map(([x, y]) => Math.hypot(x, y)));
@@ -48,7 +48,7 @@ export class World {
     this.end = this.t[this.rows - 1];
   }
 
-  /** The rows that there are of `pos` or `targets`. */
+  /** The rows that there are of `pos`, `targets` or `loads`. */
   known(name) {
     return this[name]?.subarray(0, SIZES[name] * this.n * this.rows) ?? [];
   }
@@ -67,9 +67,9 @@ export class World {
     return [low, (time - t[low]) / (t[high] - t[low])];
   }
 
-  /** Position of a drone; false where it has none. */
-  position(row, share, i, out) {
-    const a = 3 * (row * this.n + i), b = share ? a + 3 * this.n : a, p = this.pos;
+  /** Position of a drone, or of its load; false where it has none. */
+  position(row, share, i, out, p = this.pos) {
+    const a = 3 * (row * this.n + i), b = share ? a + 3 * this.n : a;
     out.set(p[a] + share * (p[b] - p[a]), p[a + 1] + share * (p[b + 1] - p[a + 1]), p[a + 2] + share * (p[b + 2] - p[a + 2]));
     return Math.abs(out.x) < HUGE && Math.abs(out.y) < HUGE && Math.abs(out.z) < HUGE;
   }
@@ -142,7 +142,7 @@ export function bounds(worlds, scenes) {
     }
   };
   for (const world of worlds)
-    for (const array of [world.known("pos"), world.known("targets")]) include(array, Math.ceil((array.length * worlds.length) / 3 / SAMPLES));
+    for (const array of [world.known("pos"), world.known("targets"), world.known("loads")]) include(array, Math.ceil((array.length * worlds.length) / 3 / SAMPLES));
   if (!(low[0] <= high[0])) include([-1, -1, 0, 1, 1, 1], 1);
   const [l, h] = [[...low], [...high]], reach = Math.max(0.5, Math.hypot(...h.map((x, k) => x - l[k])) / 2);
   const near = ({ half, low, high }) => half < reach && [0, 1, 2].every((k) => low[k] < h[k] + reach / 2 && high[k] > l[k] - reach / 2);

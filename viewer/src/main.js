@@ -1,7 +1,7 @@
 // The page: decodes the flight, builds the scene, and plays it.
 
 import { Vector3 } from "three";
-import { Arrows, FORCE, THRUST, TORQUE } from "./arrows.js";
+import { Arrows, CONTACT, FORCE, THRUST, TORQUE } from "./arrows.js";
 import { Fleet } from "./fleet.js";
 import { armOf, bounds, scratch, World } from "./flight.js";
 import { CameraImages } from "./camera.js";
@@ -9,6 +9,7 @@ import { drawCurve } from "./curve.js";
 import { handles } from "./handles.js";
 import { History } from "./history.js";
 import { JET, Jets } from "./jets.js";
+import { Loads } from "./loads.js";
 import { Names, named } from "./names.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
@@ -21,6 +22,7 @@ import { legible, theme } from "./theme.js";
 import { Trail } from "./trails.js";
 import { PathVectors, VECTOR } from "./vectors.js";
 
+const MARGIN = 2; // arms of the largest drone around the flight, that the camera shows
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
 const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
@@ -42,6 +44,7 @@ class Player {
     this.surroundings = header.scenes.map((scene) => ({ ...scene, groups: [] }));
     this.trails = this.worlds.map((world, w) => new Trail(this.stage, world, (i) => this.colors(w, i)));
     this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
+    this.loads = this.worlds.map((world) => new Loads(this.stage, world));
     this.jets = new Jets(this.stage, this.worlds);
     this.vectors = this.worlds.filter(({ arrows }) => arrows).map((world) => new PathVectors(this.stage, world));
     this.ribbon = comparable(this.worlds) ? new Ribbon(this.stage, this.worlds) : null;
@@ -172,7 +175,10 @@ class Player {
   arrange() {
     const { panel, worlds, stage } = this, mode = worlds.length > 1 ? panel.layout : "ghosts";
     const seen = this.history ? [worlds[this.history.kept]] : worlds;
-    const { low, high, points: corners } = bounds(seen, this.surroundings), span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
+    const { low, high, points: corners } = bounds(seen, this.surroundings);
+    const margin = MARGIN * Math.max(...seen.flatMap(({ kinds }) => kinds.map(armOf)));
+    corners.push(low.clone().subScalar(margin), high.clone().addScalar(margin));
+    const span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
     const [dx, dy] = [1.25 * Math.max(span.x, 0.5), 1.25 * Math.max(span.y, 0.5)];
     this.sideBySide = mode === "grid";
     this.top = low.clone().add(high).multiplyScalar(0.5).setZ(high.z);
@@ -271,6 +277,7 @@ class Player {
     this.fleet.place(time, passed, this.layout, panel.mode === "board" ? panel : null);
     this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
     this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], this.fleet));
+    this.loads.forEach((loads, w) => loads.show(time, this.layout[w], this.fleet));
     this.jets.show(time, shown.jets, this.layout);
     for (const vectors of this.vectors) vectors.show(this.layout[vectors.world.index]);
     this.ribbon?.show(time, panel.trail, this.compared);
@@ -296,6 +303,7 @@ class Player {
     const row = (color, text) => rows.push(`<i style="background:${color}"></i>${text}`);
     if (panel.shown.thrust) row(THRUST, "thrust of a rotor");
     if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
+    if (panel.shown.wrench && this.worlds.some(({ contacts }) => contacts)) row(CONTACT, "contact force");
     if (this.vectors.length) row(VECTOR, "vectors along the path");
     if (this.compared) row(ERROR, `${short(100 * this.ribbon.distance(this.time, panel.drone))} cm between the two flights`);
     if (panel.shown.jets) row(JET, "downwash, as wide as it has half the speed of its axis");

@@ -4,7 +4,7 @@ export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 const KEYS = [
   ["space", "play, pause"], ["← →", "one step back, forward; with shift ten"], ["home end", "start, end"], ["↑ ↓", "faster, slower"],
   ["1 2 3", "orbit, follow, on board"], ["n p", "next, previous drone"], ["w", "next world"], ["g", "other worlds: ghosts, side by side, hidden"],
-  ["t", "trail"], ["b", "size of the drones"], ["f", "thrust of the rotors"], ["r", "resultant force and torque"], ["d", "downwash"], ["e", "error between two flights"], ["o", "targets"], ["l", "names"],
+  ["t", "trail"], ["b", "size of the drones"], ["f", "thrust of the rotors"], ["r", "resultant force and torque, contact force"], ["d", "downwash"], ["e", "error between two flights"], ["o", "targets"], ["l", "names"],
   ["c", "camera back to the start"], ["?", "these keys"],
 ];
 

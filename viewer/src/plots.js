@@ -15,10 +15,10 @@ const vector = (name, symbol, unit, array, target) =>
 
 export const SIGNALS = [
   {
-    name: "distance from target", unit: "m",
+    name: "distance from target", unit: "m", // of the load of a drone that carries one
     value: (world, row, i) => {
       if (!world.targets) return NaN;
-      const a = 3 * (row * world.n + i), p = world.pos, q = world.targets;
+      const a = 3 * (row * world.n + i), p = world.loads ?? world.pos, q = world.targets;
       return Math.hypot(p[a] - q[a], p[a + 1] - q[a + 1], p[a + 2] - q[a + 2]);
     },
   },

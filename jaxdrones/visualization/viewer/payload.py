@@ -22,8 +22,9 @@ from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing.serialization import scene_to_dict
 from jaxdrones.visualization.palette import COLORS, DISTINCT, as_rgb, colors
 from jaxdrones.visualization.shots import only_shapes
+from jaxdrones.visualization.viewer.contacts import contact_forces
 
-_LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5}  # m, of rounding to int16
+_LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5, "loads": 5e-5}  # m, of rounding to int16
 _FARTHEST = 10.0  # m: depth of the darkest pixel, if any is as far
 _MOST = 2_000_000  # states of drones in a page, 60 MB
 _LEVELS = 65535  # steps of an int16 beside the first
@@ -97,6 +98,8 @@ def encode(
             | ({"farthest": _farthest(images.frames)} if kind == "depth" else {})
             for kind, images in record.images.items()
         ]
+        forces = contact_forces(record)
+        world["contacts"] = None if forces is None else arrays.add(forces)
         world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
         worlds.append(world)
     if arrows is not None:
@@ -114,13 +117,14 @@ def encode_rows(record: FlightLog) -> str:
 
 
 def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
-    """Arrays of a flight for the page by name; unknown targets are `None`."""
+    """Arrays of a flight for the page by name; unknown targets and loads are `None`."""
     rows: dict[str, Any] = {"t": arrays.add(record.t)}
     for name in ("pos", "quat", "vel", "omega", "rpm"):
         rows[name] = arrays.add(getattr(record, name), _LARGEST_ERROR.get(name, math.inf))
-    for name, target in (("targets", record.target_pos), ("target_vel", record.target_vel)):
-        known = bool(np.isfinite(target).any())
-        rows[name] = arrays.add(target, _LARGEST_ERROR.get(name, math.inf)) if known else None
+    optional = {"targets": record.target_pos, "target_vel": record.target_vel, "loads": record.load_pos}
+    for name, values in optional.items():
+        known = bool(np.isfinite(values).any())
+        rows[name] = arrays.add(values, _LARGEST_ERROR.get(name, math.inf)) if known else None
     return rows
 
 

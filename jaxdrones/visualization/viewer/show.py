@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import checked, choice, number
 from jaxdrones.checks import check_choice, check_number, check_params, short_repr
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
@@ -149,7 +150,8 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     check_number("dt", dt, "s", above=0)
     check_params(params)
     check_size(flight.pos)
-    flight = jax.tree.map(np.asarray, flight.replace(aux={}))
+    loads = {"payload": flight.aux["payload"]} if loads_of(flight) is not None else {}
+    flight = jax.tree.map(np.asarray, flight.replace(aux=loads))
     if flight.pos.ndim not in (3, 4):
         raise UserError(
             f"pos of the trajectory has shape {flight.pos.shape}; give (K, n, 3) of K times and n drones, or "
@@ -196,11 +198,18 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Fli
         t=dt * np.arange(1, steps + 1),
         **{name: getattr(flight, name) for name in ("pos", "quat", "vel", "omega", "rpm")},
         target_pos=targets,
+        load_pos=np.asarray(np.nan) if loads_of(flight) is None else loads_of(flight),
         labels=labels,
         conditions=LoggedConditions({}, f"{n} drone{'s' * (n > 1)}, {steps * dt:g} s"),
         params=params,
         images=_images(of_trajectory["images"] or {}, dt * np.arange(1, steps + 1), n),
     )
+
+
+def loads_of(state: State) -> Any:
+    """Positions of the loads of the model `payload` on the cables of drones; `None` without it."""
+    load = state.aux.get("payload")
+    return load.pos if isinstance(load, PointMass) else None
 
 
 def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str, ImageSequence]:

@@ -18,6 +18,7 @@ from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibi
 from jaxdrones.writing import write
 
 _FIRST = "forest"
+_SIMULATED = ("fly it yourself", "fly twenty")  # in the page, listed after the first flight
 
 
 def add(commands) -> None:
@@ -55,6 +56,7 @@ def _demo(options: argparse.Namespace) -> int:
         flight = _own(options.policy, options.drones)
     output = options.output or Path("runs") / "demo.html"
     check_writable(output)
+    exhibits = dict(sorted(exhibits.items(), key=lambda named: named[0] not in _SIMULATED))
     exhibits = {flight.name: flight} | exhibits
     write(output, gallery(list(exhibits.values())).encode())
     size = f"{output.stat().st_size / 1e6:.1f} MB"

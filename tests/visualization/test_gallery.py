@@ -13,6 +13,7 @@ from jaxdrones.visualization import browser
 from jaxdrones.visualization.viewer.gallery import read_exhibits
 from jaxdrones.visualization.viewer.payload import decode
 
+CHOSEN = "document.querySelector('[aria-current]')"
 EXHIBITS = read_exhibits(assets.folder() / "demo")
 
 
@@ -45,7 +46,8 @@ def test_a_thousand_drones_and_a_real_flight_beside_its_simulation_are_shown():
 
 def test_the_page_begins_with_the_flight_that_was_asked_for(page):
     data = json.loads(re.search(r'<script id="data" type="application/json">(.*)</script>', page.read_text())[1])
-    assert data["exhibits"][0]["name"] == "recovery"
+    names = [exhibit["name"] for exhibit in data["exhibits"]]
+    assert names[:3] == ["recovery", "fly it yourself", "fly twenty"] and names[3:] == sorted(names[3:])
     assert len(data["exhibits"]) == len(EXHIBITS)
 
 
@@ -102,6 +104,8 @@ def test_every_flight_plays_without_a_message_and_fits(page, width):
         for exhibit in EXHIBITS:
             tab.run(f"location.hash = {exhibit.name!r}")
             tab.wait(f"document.querySelector('[aria-current]').textContent === {exhibit.name!r}")
+            left, right = tab.run(f"(({{ left, right }}) => [left, right])({CHOSEN}.getBoundingClientRect())")
+            assert 0 <= left < right <= width  # in view, also in a list that scrolls
             tab.wait(f"{frame}.srcdoc.includes({exhibit.payload[:200]!r})")
         assert tab.run("document.documentElement.scrollWidth") <= width
         assert tab.problems == []

@@ -23,6 +23,7 @@ FEW = 30  # drones of the timed loop
 MOST_PAIRS = 2**22  # tried by `all pairs`, so that a benchmark ends
 STEPS = 5
 NAMES = ("all pairs", "cells", "gym-pybullet-drones")
+_LABELS = {"cells": "pairs within 2 m, by a grid"}  # of the figure
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,8 +52,8 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
 
 def draw(rows: list[dict[str, float]], path: str) -> None:
     """Draw the seconds of a step over the number of drones; those of gym-pybullet-drones are extrapolated."""
-    curves = {name: [(row["drones"], row[name]) for row in rows if row.get(name)] for name in NAMES}
-    loglog(path, curves, "drones in a world", "s per step", dashed=NAMES[2])
+    curves = {_LABELS.get(name, name): [(row["drones"], row[name]) for row in rows if row.get(name)] for name in NAMES}
+    loglog(path, curves, "drones in a world", "seconds per step", dashed=NAMES[2])
 
 
 def measure(n: int, repeats: int) -> dict[str, float]:

@@ -304,8 +304,8 @@ def test_the_command_line_trains_in_the_browser(tmp_path, capsys, monkeypatch):
     settings = ["--set", "worlds=8", "--set", "horizon=4", "--budget", "2", "--episodes", "8", "--no-figure"]
     assert main(["train", "hover", "--live", *settings, "--output", str(tmp_path / "run")]) == 0
     assert "open http://127.0.0.1:" in capsys.readouterr().out
-    assert [title for _, title, *_ in shown] == [f"hover by bptt, update {k} of 2: success 0.0 %" for k in (1, 2)]
-    assert [update for update, _ in shown[-1][2]] == [1, 2]
+    assert [title for _, title, *_ in shown] == [f"hover by bptt, update {k} of 2: success 0.0 %" for k in (0, 1, 2)]
+    assert [update for update, _ in shown[-1][2]] == [0, 1, 2]
 
 
 def test_trainings_that_cannot_be_shown_are_refused(capsys):

@@ -244,7 +244,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             _label(axes, dots)
         axes.xaxis.set_minor_formatter("")
         axes.grid(which="major", alpha=0.2)
-    figure.axes[0].set_ylabel(f"success in {', '.join(DRAWN)}, %")
+    figure.axes[0].set_ylabel(f"success (%), mean and worst of\n{', '.join(DRAWN)}")
     figure.savefig(path, dpi=120)
 
 

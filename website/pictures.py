@@ -1,35 +1,26 @@
-"""Makes docs/images/tasks: a film of the flight in the demo, NAME.webp, or for other tasks the first moment, NAME.png.
+"""Makes docs/images/tasks: a film of the flight in the demo, NAME.webp, or for other tasks the start, NAME.png.
 
     python website/pictures.py [NAME ...]
 
 It needs Chromium or Chrome, the extra `video`, and the viewer's page, which `make viewer` builds.
 """
 
-import dataclasses
 import io
 import sys
 import tempfile
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
 import jaxdrones as jd
 from jaxdrones import assets
 from jaxdrones.envs import TASKS
-from jaxdrones.sensing import photograph
-from jaxdrones.visualization import drawn_film
 from jaxdrones.visualization.browser import open_tab
 from jaxdrones.visualization.viewer.gallery import read_exhibits
 from jaxdrones.visualization.viewer.page import Page
-from jaxdrones.visualization.viewer.show import records_of
 
-VIEWS = {  # task among obstacles -> where the camera is and what it looks at, m, world
-    "gates": ((-2.6, -2.6, 2.4), (0.2, 0.0, 0.6)),
-    "forest": ((-6.0, -9.0, 8.0), (8.0, 0.0, 0.0)),
-}
 _SIZE = (640, 360)  # pixels
 _FPS, _LONGEST = 12, 6.0  # frames per second, and s, of a film
 
@@ -41,21 +32,24 @@ def main() -> None:
     flights = {exhibit.name: exhibit for exhibit in read_exhibits(assets.folder() / "demo")}
     for name in sys.argv[1:] or TASKS:
         if name not in flights:
-            Image.fromarray(_picture(name)).quantize(64).save(folder / f"{name}.png", optimize=True)
+            _frames(_start(name), 1)[0].quantize(256, Image.Quantize.MAXCOVERAGE).save(
+                folder / f"{name}.png", optimize=True
+            )
+            print(f"wrote {name}.png")
             continue
-        first, *others = _film(Page(name, flights[name].payload))
+        first, *others = _frames(Page(name, flights[name].payload), round(_FPS * _LONGEST))
         file = folder / f"{name}.webp"
         first.save(file, save_all=True, append_images=others, duration=1000 / _FPS, loop=0, quality=50, method=6)
         print(f"wrote {file.name}, {file.stat().st_size / 1e3:.0f} kB")
 
 
-def _film(page: Page) -> list[Image.Image]:
-    """Frames of the page, the whole flight in real time, or its first seconds."""
+def _frames(page: Page, most: int) -> list[Image.Image]:
+    """Frames of the page in real time, at most some number."""
     with open_tab() as tab, tempfile.TemporaryDirectory() as folder:
         tab.open(page.save(Path(folder) / "page.html"), *_SIZE)
         tab.run("jaxdrones.film('orbit')")
         tab.press("l")  # no names
-        count = round(_FPS * min(_LONGEST, tab.run("jaxdrones.player.end")))
+        count = max(1, min(most, round(_FPS * tab.run("jaxdrones.player.end"))))
         frames = []
         for k in range(count):
             tab.run(f"jaxdrones.frameAt({k / _FPS}, {1 / _FPS})")
@@ -63,19 +57,13 @@ def _film(page: Page) -> list[Image.Image]:
     return frames
 
 
-def _picture(name: str) -> np.ndarray:
-    """Start of an episode: with obstacles from a suitable viewpoint, else the first frame of a film."""
+def _start(name: str) -> Page:
+    """Page of the start of an episode."""
     with jd.make(name) as env:
         world = jax.jit(env.reset)(jax.random.key(0))[1]
         target = np.asarray(env.task.target_now(world).pos)
-    if name in VIEWS:
-        eye, middle = map(jnp.asarray, VIEWS[name])
-        camera = jd.Camera(resolution=_SIZE, field_of_view=60.0)
-        return np.asarray(photograph(world.scene, world.params, world.drones, eye, middle, camera))
     row = jax.tree.map(lambda x: np.asarray(x)[None], world.drones)
-    given = {"params": world.params, "dt": env.dt, "targets": target, "labels": None, "images": None}
-    (record,) = records_of(row, given)
-    return next(drawn_film.frames(dataclasses.replace(record, scene=world.scene), name, 1, _SIZE))
+    return jd.show(row, world.params, dt=env.dt, targets=target, scene=world.scene, title=name)
 
 
 if __name__ == "__main__":

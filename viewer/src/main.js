@@ -22,7 +22,7 @@ import { legible, theme } from "./theme.js";
 import { Trail } from "./trails.js";
 import { PathVectors, VECTOR } from "./vectors.js";
 
-const MARGIN = 2; // arms of the largest drone around the flight, that the camera shows
+const MARGIN = 2; // arms of the largest drone, which the camera shows around the flight
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
 const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
@@ -175,11 +175,9 @@ class Player {
   arrange() {
     const { panel, worlds, stage } = this, mode = worlds.length > 1 ? panel.layout : "ghosts";
     const seen = this.history ? [worlds[this.history.kept]] : worlds;
-    const { low, high, points: corners } = bounds(seen, this.surroundings);
-    const margin = MARGIN * Math.max(...seen.flatMap(({ kinds }) => kinds.map(armOf)));
-    corners.push(low.clone().subScalar(margin), high.clone().addScalar(margin));
-    const span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
+    const { low, high, points: corners } = bounds(seen, this.surroundings), span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
     const [dx, dy] = [1.25 * Math.max(span.x, 0.5), 1.25 * Math.max(span.y, 0.5)];
+    stage.margin = MARGIN * Math.max(...seen.flatMap(({ kinds }) => kinds.map(armOf)));
     this.sideBySide = mode === "grid";
     this.top = low.clone().add(high).multiplyScalar(0.5).setZ(high.z);
     this.layout = worlds.map((_, w) => ({

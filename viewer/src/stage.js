@@ -40,6 +40,7 @@ export class Stage {
     this.camera = new PerspectiveCamera(45, 1, 0.01, 1000);
     this.camera.up.set(0, 0, 1);
     this.pixels = new Vector2(1, 1);
+    this.margin = 0; // m, which the camera shows around the points of the flight
     this.share = 1; // of the full resolution, while playing
     this.sharp = true; // whether the picture stands still and is drawn in full resolution
     this.slow = 0; // s, a frame took on average
@@ -92,7 +93,8 @@ export class Stage {
     let away = 0;
     for (const point of points) {
       p.subVectors(point, middle);
-      away = Math.max(away, Math.max(Math.abs(p.dot(right)) / wide, Math.abs(p.dot(up)) / tall) + p.dot(VIEW));
+      const [x, y] = [right, up].map((axis) => Math.abs(p.dot(axis)) + this.margin);
+      away = Math.max(away, Math.max(x / wide, y / tall) + p.dot(VIEW));
     }
     away = Math.max(1.25 * away, 0.3 * this.radius);
     this.camera.position.copy(middle).addScaledVector(VIEW, away);

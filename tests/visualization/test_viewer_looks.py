@@ -20,14 +20,17 @@ from jaxdrones.visualization.viewer import show
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")]
 
 SMALLEST = 12  # pixels
-PIXELS = """((index) => {
+SEEN = """((index) => {
     const { fleet, stage } = jaxdrones.player, { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
     const drawn = [...mesh.geometry.attributes.position.array.slice(place * size, (place + 1) * size)];
     const point = stage.orbit.target.clone(), seen = [];
     for (let k = 0; k < drawn.length; k += 3) seen.push(stage.project(point.fromArray(drawn, k)));
-    const extent = (values) => Math.max(...values) - Math.min(...values);
-    return Math.max(...[0, 1].map((axis) => extent(seen.map((at) => at[axis]))));
+    return seen;
 })"""
+PIXELS = f"""((index) => {{
+    const seen = {SEEN}(index), extent = (values) => Math.max(...values) - Math.min(...values);
+    return Math.max(...[0, 1].map((axis) => extent(seen.map((at) => at[axis]))));
+}})"""
 BOXES = """[...document.querySelectorAll("h1, #legend, #labels span:not([hidden]), .plot label, .plot output")]
     .map((element) => element.getBoundingClientRect()).filter((box) => box.width)
     .map(({ left, right, top, bottom }) => [left, right, top, bottom])"""
@@ -73,6 +76,17 @@ def test_no_drone_is_smaller_than_12_pixels_unless_the_true_size_is_chosen(view,
     tab.run("jaxdrones.player.panel.set('size', 1); jaxdrones.player.changed(); jaxdrones.player.draw(0)")
     assert tab.run("jaxdrones.player.fleet.largest") == 1
     assert tab.run(f"{PIXELS}(0)") < SMALLEST
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.12])
+def test_the_first_view_shows_drones_as_a_whole_however_close_they_are(view, apart):
+    size = (640, 480)
+    tab = view(page_of([[0.0, 0.0, 1.0], [0.0, apart, 1.0 + apart]]), size)
+    tab.run("jaxdrones.film('orbit', 1)")
+    tab.run("jaxdrones.frameAt(0.1, 0)")
+    for drone in (0, 1):
+        seen = np.array(tab.run(f"{SEEN}({drone})"))
+        assert (seen > 0).all() and (seen < size).all()
 
 
 def test_a_shadow_is_below_its_drone_and_fades_with_height(view):

@@ -47,16 +47,10 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.figure:
         names = dict.fromkeys(name for row in rows for name in row["rates"])
         rates = {
-            _labelled(name): [(row["worlds"], 1e6 * row["rates"][name]) for row in rows if name in row["rates"]]
-            for name in names
+            name: [(row["worlds"], 1e6 * row["rates"][name]) for row in rows if name in row["rates"]] for name in names
         }
         loglog(options.figure, rates, "worlds", "drone-steps per second")
     return {"about": facts, "rows": rows}, lines
-
-
-def _labelled(name: str) -> str:
-    """Name of a program in the figure."""
-    return name.replace("held", "constant rotor speeds").replace("controlled", "attitude controller")
 
 
 def _rest(row: dict, name: str) -> str:

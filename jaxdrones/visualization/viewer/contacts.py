@@ -14,6 +14,7 @@ from jaxdrones.visualization.shots import only_shapes
 _NEAR = 5e-3  # m: distance below which a drone touches a surface
 _SMALLEST = 0.1  # of the weight; drag and downwash are mostly smaller
 _ANGLES = np.arange(8) * np.pi / 4
+_rims, _axes = jax.jit(jax.vmap(rim)), jax.jit(jax.vmap(rotation.axes))
 
 
 def contact_forces(log: FlightLog) -> np.ndarray | None:
@@ -25,21 +26,28 @@ def contact_forces(log: FlightLog) -> np.ndarray | None:
     scene = only_shapes(log.scene)
     if len(log.t) < 2 or not (scene.ground or scene.has_obstacles):
         return None
-    params = jax.tree.map(np.asarray, log.params.replace(aux={}))
-    x, y, z = (np.asarray(axis, float) for axis in jax.vmap(jax.vmap(rotation.axes))(jnp.asarray(log.quat)))
-    with np.errstate(invalid="ignore", over="ignore"):
-        acceleration = np.gradient(np.asarray(log.vel, float), log.t, axis=0) + params.gravity[:, None] * [0, 0, 1]
-        thrust = (params.kf * np.sum(np.asarray(log.rpm, float) ** 2, axis=-1))[..., None] * z
-        forces = params.mass[:, None] * acceleration - thrust
-        large = np.linalg.norm(forces, axis=-1) > _SMALLEST * params.mass * params.gravity
-    row, drone = np.nonzero(large)
+    radius, ring = (np.asarray(x) for x in _rims(log.params))
+    reach = radius + ring + np.abs(log.params.collision_offset) + _NEAR
+    row, drone = np.nonzero((log.pos[..., 2] < reach) | scene.has_obstacles)
     if not len(row):
         return None
-    radius, ring = (np.asarray(a)[drone, None, None] for a in jax.vmap(rim)(log.params))
-    cos, sin = np.cos(_ANGLES)[:, None], np.sin(_ANGLES)[:, None]
-    around = ring * (cos * x[row, drone][:, None] + sin * y[row, drone][:, None])
-    centers = (log.pos + params.collision_offset[:, None] * z)[row, drone][:, None] + around
-    distances = np.asarray(jax.jit(jax.vmap(jax.vmap(scene.distance)))(jnp.asarray(centers)))
-    touching = np.zeros(large.shape, bool)
-    touching[row, drone] = np.min(distances, axis=1) < radius[:, 0, 0] + _NEAR
-    return np.where(touching[..., None], forces, 0) if touching.any() else None
+    params = jax.tree.map(lambda x: np.asarray(x, float)[drone], log.params.replace(aux={}))
+    x, y, z = (np.asarray(axis, float) for axis in _axes(jnp.asarray(log.quat[row, drone])))
+    with np.errstate(invalid="ignore", over="ignore"):
+        acceleration = np.gradient(np.asarray(log.vel, float), log.t, axis=0)[row, drone]
+        thrust = params.kf * np.sum(np.asarray(log.rpm[row, drone], float) ** 2, axis=-1)
+        forces = params.mass[:, None] * acceleration + params.weight[:, None] * [0, 0, 1] - thrust[:, None] * z
+        large = np.linalg.norm(forces, axis=-1) > _SMALLEST * params.weight
+    if not large.any():
+        return None
+    row, drone, forces, x, y, z = (array[large] for array in (row, drone, forces, x, y, z))
+    around = np.cos(_ANGLES)[:, None] * x[:, None] + np.sin(_ANGLES)[:, None] * y[:, None]
+    center = log.pos[row, drone] + np.asarray(log.params.collision_offset)[drone, None] * z
+    spheres = center[:, None] + ring[drone, None, None] * around
+    distance = np.min(jax.jit(jax.vmap(jax.vmap(scene.distance)))(jnp.asarray(spheres)), axis=1)
+    touching = distance < radius[drone] + _NEAR
+    if not touching.any():
+        return None
+    found = np.zeros(log.pos.shape)
+    found[row[touching], drone[touching]] = forces[touching]
+    return found

@@ -117,7 +117,7 @@ def test_a_bag_without_a_flight_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("late", "speeds", "said"),
-    [(0, 4, None), (7, 4, "of its 1 drones have no time in common"), (0, 3, "/motors has not 4 numbers")],
+    [(0, 4, None), (7, 4, "of its 1 drones have no time in common"), (0, 3, "/motors does not have 4 numbers")],
 )
 def test_a_flight_is_that_of_the_drones_whatever_else_a_bag_holds(late, speeds, said, tmp_path):
     odom, motors = topics.output(0, "odom"), topics.output(0, "motors")

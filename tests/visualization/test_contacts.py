@@ -49,6 +49,16 @@ def test_only_a_surface_that_is_touched_exerts_a_force():
     assert contact_forces(dataclasses.replace(log_at([REST, 1.0]), rpm=np.full((5, 2, 4), np.nan))) is None
 
 
+def test_the_rim_is_where_the_offset_of_the_collision_shape_says():
+    offset = np.float32(0.03)
+    log = log_at([REST + float(PARAMS.collision_offset[0]) + offset] * 2)
+    quat = log.quat.copy()
+    quat[:, 0] = [1.0, 0.0, 0.0, 0.0]  # upside down: the shape is below the center of mass
+    log = dataclasses.replace(log, quat=quat, params=PARAMS.replace(collision_offset=jnp.full(2, offset)))
+    forces = contact_forces(log)
+    assert (forces[:, 0, 2] > 0.9 * WEIGHT).all() and (forces[:, 1] == 0).all()
+
+
 @pytest.mark.slow
 def test_a_drone_that_lies_on_the_simulated_ground_has_its_force():
     step = jd.make_step(effects=(jd.ground_contact,), dt=1 / 240)

@@ -56,8 +56,8 @@ class GradientConfig(Config):
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
     outlier_gradient: PositiveOrInfinite = _UNLIMITED
-    """Largest gradient of a world at a control step over the median of all worlds, with `gradient="decay"`; longer ones
-    are scaled down. A few chaotic worlds then cannot drown the others."""
+    """Largest gradient of a world at a control step over the median of all worlds; longer ones are scaled down. A few
+    chaotic worlds then cannot drown the others."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Switch = True
@@ -79,13 +79,12 @@ def with_gradient(env: Env, config: GradientConfig) -> Env:
 
 def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
     """Function of the worlds between control steps; it changes gradients, not values."""
-    if config.gradient != "decay":
-        return lambda worlds: worlds
+    limited = not (is_concrete(config.outlier_gradient) and config.outlier_gradient >= _UNLIMITED)
 
     def changed(worlds: Any) -> Any:
-        if not (is_concrete(config.outlier_gradient) and config.outlier_gradient >= _UNLIMITED):
+        if limited:
             worlds = limit_gradient(worlds, config.outlier_gradient)
-        return scale_gradient(worlds, config.gradient_decay)
+        return scale_gradient(worlds, config.gradient_decay) if config.gradient == "decay" else worlds
 
     return changed
 

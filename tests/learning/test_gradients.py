@@ -72,6 +72,7 @@ def flights():
         "decay": both(gradient="decay", gradient_decay=0.5),
         "surrogate": both(gradient="surrogate"),
         "point mass": both(gradient="point_mass"),
+        "limited": both(gradient="exact", outlier_gradient=0.1),
     }
 
 
@@ -85,6 +86,11 @@ def test_no_option_changes_the_flight(flights):
 def test_a_decay_of_one_is_exact_and_a_smaller_one_shrinks_what_is_long_ago(flights):
     np.testing.assert_allclose(flights["no decay"][1], flights["exact"][1], rtol=1e-9, atol=1e-12)
     assert jnp.linalg.norm(flights["decay"][1]) < 0.5 * jnp.linalg.norm(flights["exact"][1])
+
+
+@pytest.mark.slow
+def test_outliers_are_limited_with_every_kind_of_gradient(flights):
+    assert 0 < jnp.linalg.norm(flights["limited"][1]) < 0.5 * jnp.linalg.norm(flights["exact"][1])
 
 
 @pytest.mark.slow

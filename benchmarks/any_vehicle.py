@@ -6,9 +6,11 @@ and 90 degrees away, scaled by the vehicle where it is drawn) in the same episod
   NAME        a bundled vehicle, lagging rotors, without delay and noise;
   drawn       vehicles of 20 g to 3 kg, drag, sensor noise, a delay of 0 to 40 ms, another one in every episode;
   A to B kg   the same, vehicles of a class of masses;
+  A to B kg, T s  the same in T seconds: the time to settle grows as the root of the arm (Froude scaling), from 3 s
+              for a Crazyflie to that of the lightest vehicle of the class;
   delay       drawn vehicles with a delay in all episodes;
   wind        drawn vehicles with a delay of 0 to 40 ms in Dryden gusts of 7.7 m/s at 20 ft.
-Success is within 5 cm and 0.1 m/s of the goal for the last two of five seconds, in wind within 25 cm.
+Success is within 5 cm and 0.1 m/s of the goal for the last two of five (or T) seconds, in wind within 25 cm.
 """
 
 import argparse
@@ -16,20 +18,23 @@ import dataclasses
 import itertools
 
 import jax
+import jax.numpy as jnp
 
 import jaxdrones as jd
 from benchmarks.common import success_rate
 from benchmarks.leaderboard_scenarios import near
-from jaxdrones import assets
+from jaxdrones import assets, vehicles
 from jaxdrones.envs import Env
 from jaxdrones.envs.randomize import AnyVehicle
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.policies import POLICIES
+from jaxdrones.tasks.hover import SETTLED
 
 SEED = 1_000_000  # of the episodes: the same for all policies, and not that of a training
 MASSES = (0.02, 0.035, 0.1, 0.3, 1.0, 2.0, 3.0)  # kg, bounds of the classes
 DELAYS = (0, 20, 40)  # ms
 WIND = 7.7  # m/s at 20 ft
+DURATION = 5.0  # s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,11 +47,20 @@ def conditions() -> dict[str, Env]:
     found = {name: jd.make("hover", action="throttle", vehicle=name, rotors="lagging") for name in assets.vehicles()}
     found["drawn"] = drawn()
     for low, high in itertools.pairwise(MASSES):
-        found[f"{low:g} to {high:g} kg"] = drawn(realistic=True, randomize=(AnyVehicle(low, high),))
+        randomize, duration = (AnyVehicle(low, high),), scaled_duration(low)
+        found[f"{low:g} to {high:g} kg"] = drawn(realistic=True, randomize=randomize)
+        found[f"{low:g} to {high:g} kg, {duration:g} s"] = drawn(True, randomize=randomize, duration=duration)
     found |= {f"delay {delay} ms": drawn(delay=delay / 1000) for delay in DELAYS}
     wind = drawn(disturbance=jd.dryden(WIND))
     found[f"wind {WIND} m/s"] = dataclasses.replace(wind, task=dataclasses.replace(wind.task, success=near))
     return found
+
+
+def scaled_duration(mass: float) -> float:
+    """Duration of an episode by Froude scaling of the time to settle, s, for a vehicle of a mass in kg."""
+    crazyflie = jd.load_params("cf2x")
+    arm = vehicles.median(crazyflie, mass, mass).arm
+    return round(SETTLED + (DURATION - SETTLED) * float(jnp.sqrt(arm / crazyflie.arm)), 1)
 
 
 def drawn(realistic: bool | str = "any", **options) -> Env:
@@ -64,9 +78,9 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         error = report.final_error_percentiles
         row = {"condition": name, "policy": policy, "success": report.success, "interval": report.success_interval}
         rows.append(row | {"error p50": error[50], "error p99": error[99]})
-    lines = ["condition        | policy      | success [95 % interval]  | error cm p50    p99"]
+    lines = ["condition             | policy      | success [95 % interval]  | error cm p50    p99"]
     lines += [
-        f"{row['condition']:16} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"
+        f"{row['condition']:21} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"
         f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
         for row in rows
     ]

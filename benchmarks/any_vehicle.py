@@ -78,9 +78,9 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         error = report.final_error_percentiles
         row = {"condition": name, "policy": policy, "success": report.success, "interval": report.success_interval}
         rows.append(row | {"error p50": error[50], "error p99": error[99]})
-    lines = ["condition             | policy      | success [95 % interval]  | error cm p50    p99"]
+    lines = ["condition                | policy      | success [95 % interval]  | error cm p50    p99"]
     lines += [
-        f"{row['condition']:21} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"
+        f"{row['condition']:24} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"
         f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
         for row in rows
     ]

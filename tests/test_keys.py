@@ -129,6 +129,8 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
 
     monkeypatch.setattr("jaxdrones.envs.randomize.draw", draw)
     env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
+    jax.effects_barrier()
+    seen.clear()  # of the starts with which the environment was checked
     begin = env.begin
     object.__setattr__(env, "begin", lambda key, *progress: (tell("reset", key), begin(key, *progress))[1])
     _, episode = AutoReset(env).reset(KEY)

@@ -17,9 +17,8 @@ from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
-from jaxdrones.training import run as run_module
 from jaxdrones.training import trainer
-from jaxdrones.training.run import Run
+from jaxdrones.training.run import Run, report_as_dict
 
 pytestmark = pytest.mark.float32
 
@@ -398,9 +397,9 @@ def test_eval_fails_below_the_success_rate_that_is_given(trained, capsys, monkey
     command = ["eval", str(folder), "--episodes", "8", "--fail-below"]
     assert main([*command, "0.9"]) == 2 and "has no criterion of success" in capsys.readouterr().err
     assert main([*command, "2"]) == 2 and "fail-below is 2" in capsys.readouterr().err
-    report = run_module.report_as_dict
+    report = report_as_dict
     measured = {"success": 0.875, "success_interval": (0.5, 0.98)}
-    monkeypatch.setattr(run_module, "report_as_dict", lambda result: report(result) | measured)
+    monkeypatch.setattr("jaxdrones.cli.evaluate.report_as_dict", lambda result: report(result) | measured)
     assert main([*command, "0.9"]) == 1 and "87.5 %, below --fail-below 0.9" in capsys.readouterr().err
     assert main([*command, "0.875"]) == 0
 

@@ -110,7 +110,7 @@ def test_an_unknown_keyword_names_the_closest_one():
 def test_signature_and_documentation_remain():
     assert flight.__doc__ == "Height doubled."
     assert [*inspect.signature(flight).parameters][:3] == ["height", "drones", "duration"]
-    assert str(inspect.signature(Settings)).startswith("(worlds: typing.Annotated[int")
+    assert "Annotated[int" in str(inspect.signature(Settings).parameters["worlds"])
 
 
 @checked

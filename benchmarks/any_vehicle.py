@@ -48,7 +48,7 @@ def conditions() -> dict[str, Env]:
     found["drawn"] = drawn()
     for low, high in itertools.pairwise(MASSES):
         randomize, duration = (AnyVehicle(low, high),), scaled_duration(low)
-        found[f"{low:g} to {high:g} kg"] = drawn(realistic=True, randomize=randomize)
+        found[f"{low:g} to {high:g} kg"] = drawn(True, randomize=randomize)
         found[f"{low:g} to {high:g} kg, {duration:g} s"] = drawn(True, randomize=randomize, duration=duration)
     found |= {f"delay {delay} ms": drawn(delay=delay / 1000) for delay in DELAYS}
     wind = drawn(disturbance=jd.dryden(WIND))

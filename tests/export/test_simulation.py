@@ -213,7 +213,7 @@ def test_one_of_several_drones_is_pulled_and_all_are_kicked(env, tmp_path):
         apart = np.linalg.norm(goals[:, None] - goals, axis=-1)
         assert apart[~np.eye(3, dtype=bool)].min() > 0.5
         tab.wait(f"{plants}[0].steps > 500")
-        shown = np.array(tab.run("jaxdrones.player.fleet.positions(0)"))
+        shown = np.array(tab.run("jaxdrones.player.actors.fleet.positions(0)"))
         np.testing.assert_allclose(shown, goals, atol=0.03)
         x, y = tab.run(f"jaxdrones.player.stage.project(jaxdrones.simulation.place({plants}[1]))")
         for event, dx in (("mousePressed", 0), ("mouseMoved", 150)):

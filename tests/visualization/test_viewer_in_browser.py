@@ -143,7 +143,7 @@ def test_on_board_the_camera_looks_along_the_nose_and_does_not_see_its_own_drone
             expected = np.array(shape) / 2 - focal * np.array([0.15, 0.1])
             np.testing.assert_allclose(seen, expected, atol=0.5)
         scale = "(mesh.matrices ?? mesh.instanceMatrix.array)[16 * place]"
-        drawn = tab.run(f"jaxdrones.player.fleet.slots[0].map(({{ mesh, place }}) => {scale})")
+        drawn = tab.run(f"jaxdrones.player.actors.fleet.slots[0].map(({{ mesh, place }}) => {scale})")
         assert [x != 0 for x in drawn] == [i != drone for i in range(4)]
 
 
@@ -214,7 +214,7 @@ def test_the_page_follows_a_running_flight_and_holds_what_was_logged():
             positions = tab.run(f"jaxdrones.positionsAt({record.t[row]!s})")
             np.testing.assert_allclose(positions[0], record.pos[row], rtol=0, atol=1e-4)
         assert tab.run("document.getElementById('live').hidden")
-        assert tab.run("jaxdrones.player.trails[0].legs") == len(record.t) - 1
+        assert tab.run("jaxdrones.player.actors.trails[0].legs") == len(record.t) - 1
         tab.press(" ")  # what was flown is played again, without the server
         tab.wait("jaxdrones.player.playing")
         assert tab.problems == []
@@ -241,7 +241,7 @@ def test_drones_of_a_few_pixels_are_where_the_log_says(tmp_path):
     rest = jax.vmap(jd.State.at_rest)(jnp.asarray(pos, jnp.float32))
     page = show(rest, jd.repeat(jd.load_params("cf2x"), 300), dt=0.1)
     vertices = """(() => {
-        const fleet = jaxdrones.player.fleet, slot = fleet.slots[0][7], count = 3 * slot.mesh.vertices;
+        const fleet = jaxdrones.player.actors.fleet, slot = fleet.slots[0][7], count = 3 * slot.mesh.vertices;
         return [...slot.mesh.geometry.attributes.position.array.slice(slot.place * count, (slot.place + 1) * count)];
     })()"""
     with browser.open_tab() as tab:
@@ -251,7 +251,7 @@ def test_drones_of_a_few_pixels_are_where_the_log_says(tmp_path):
             seen = tab.run("jaxdrones.positionsAt(2.0)")[0]
             np.testing.assert_allclose(seen, pos[19], rtol=0, atol=1e-4)
         drawn = np.reshape(tab.run(vertices), (-1, 3))
-        reach = tab.run("jaxdrones.player.fleet.largest * jaxdrones.player.arm")
+        reach = tab.run("jaxdrones.player.actors.fleet.largest * jaxdrones.player.arm")
         assert np.abs(drawn - pos[19, 7]).max() < 1.5 * reach
         np.testing.assert_allclose(drawn[:, :2].mean(axis=0), pos[19, 7, :2], atol=1e-3)
         assert tab.problems == []

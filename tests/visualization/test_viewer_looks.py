@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is Non
 
 SMALLEST = 12  # pixels
 SEEN = """((index) => {
-    const { fleet, stage } = jaxdrones.player, { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
+    const { actors: { fleet }, stage } = jaxdrones.player, { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
     const drawn = [...mesh.geometry.attributes.position.array.slice(place * size, (place + 1) * size)];
     const point = stage.orbit.target.clone(), seen = [];
     for (let k = 0; k < drawn.length; k += 3) seen.push(stage.project(point.fromArray(drawn, k)));
@@ -74,7 +74,7 @@ def test_no_drone_is_smaller_than_12_pixels_unless_the_true_size_is_chosen(view,
         sizes = [tab.run(f"{PIXELS}({drone})") for drone in range(0, drones, max(1, drones // 10))]
         assert min(sizes) >= SMALLEST
     tab.run("jaxdrones.player.panel.set('size', 1); jaxdrones.player.changed(); jaxdrones.player.draw(0)")
-    assert tab.run("jaxdrones.player.fleet.largest") == 1
+    assert tab.run("jaxdrones.player.actors.fleet.largest") == 1
     assert tab.run(f"{PIXELS}(0)") < SMALLEST
 
 
@@ -93,13 +93,13 @@ def test_a_shadow_is_below_its_drone_and_fades_with_height(view):
     heights = np.array([0.05, 0.5, 2.0])
     pos = np.stack([np.arange(3.0), np.zeros(3), heights], axis=-1)
     tab = view(page_of(pos))
-    shadows = "jaxdrones.player.fleet.shadows.geometry.attributes"
+    shadows = "jaxdrones.player.actors.fleet.shadows.geometry.attributes"
     drawn = np.reshape(tab.run(f"[...{shadows}.position.array.slice(0, 36)]"), (3, 4, 3))
     np.testing.assert_allclose(drawn.mean(axis=1), pos * [1, 1, 0], atol=1e-4)
     dark = np.reshape(tab.run(f"[...{shadows}.color.array.slice(0, 48)]"), (3, 4, 4))[:, :, 3]
     assert (np.diff(dark.mean(axis=1)) < 0).all() and dark.max() <= 0.5
     nothing = view(page_of(pos, scene=Scene(ground=False)))
-    assert nothing.run("jaxdrones.player.fleet.shadows.count") == 0
+    assert nothing.run("jaxdrones.player.actors.fleet.shadows.count") == 0
 
 
 def test_the_ground_is_darker_where_an_obstacle_is_between_it_and_the_sun(view):
@@ -122,11 +122,11 @@ def test_the_discs_of_rotors_are_denser_the_faster_they_turn_and_blades_are_seen
     pos = np.stack([np.arange(4.0) / 4, np.zeros(4), np.ones(4)], axis=-1)
     tab = view(page_of(pos, hover * np.array([0.0, 0.5, 1.0, 1.4])))
     tab.run("jaxdrones.player.panel.set('size', 10); jaxdrones.player.changed(); jaxdrones.player.draw(0)")
-    turns = tab.run("[0, 1, 2, 3].map((i) => jaxdrones.player.fleet.turn(jaxdrones.player.worlds[0], 0, i, 0))")
+    turns = tab.run("[0, 1, 2, 3].map((i) => jaxdrones.player.actors.fleet.turn(jaxdrones.player.worlds[0], 0, i, 0))")
     density = [turn["density"][0] for turn in turns]
     np.testing.assert_allclose(density, np.array([0, 0.5, 1.0, 1.4]) / 1.6, rtol=1e-3)
     assert turns[0]["blades"][0] == 0.0 and turns[1]["blades"][0] is None  # NaN has no JSON
-    discs = "jaxdrones.player.fleet.shapes[0][0].discs"
+    discs = "jaxdrones.player.actors.fleet.shapes[0][0].discs"
     opacity = np.reshape(
         tab.run(f"[...{discs}.geometry.attributes.color.array.slice(0, 16 * {discs}.vertices)]"), (4, -1, 4)
     )
@@ -140,10 +140,10 @@ def test_the_cone_of_the_downwash_is_the_jet_that_is_simulated(view):
         np.testing.assert_allclose(drawn["speed"], _jet(jnp.asarray(z), jnp.asarray(0.0)), rtol=1e-5)
         at_edge = _jet(jnp.asarray(z), jnp.asarray(drawn["width"] ** 2))
         np.testing.assert_allclose(at_edge, drawn["speed"] / 2, rtol=1e-5)
-    assert tab.run("jaxdrones.player.jets.mesh.count") == 0
+    assert tab.run("jaxdrones.player.actors.jets.mesh.count") == 0
     tab.press("d")
     tab.run("jaxdrones.player.draw(0)")
-    jets = "jaxdrones.player.jets.mesh"
+    jets = "jaxdrones.player.actors.jets.mesh"
     cone = np.reshape(tab.run(f"[...{jets}.geometry.attributes.position.array.slice(0, 3 * {jets}.vertices)]"), (-1, 3))
     length = np.sqrt(2) * float(jd.load_params("cf2x").arm)
     np.testing.assert_allclose(np.hypot(cone[:, 0], cone[:, 1]), 0.07668 * (1 - cone[:, 2] + 5.817 * length), rtol=1e-3)
@@ -205,7 +205,7 @@ def test_texts_stand_out_from_the_page(view, scheme):
 def test_the_error_between_two_flights_is_a_ribbon_from_one_to_the_other(view):
     here, there = (at_rest([[x, 0.0, 1.0], [x, 1.0, 1.0]]) for x in (0.0, 0.2))
     tab = view(show([here, there], jd.repeat(jd.load_params("cf2x"), 2), dt=0.1))
-    ribbon = "jaxdrones.player.ribbon.mesh"
+    ribbon = "jaxdrones.player.actors.ribbon.mesh"
     assert not tab.run(f"{ribbon}.visible")
     tab.press("e")
     tab.run("jaxdrones.positionsAt(0.3)")
@@ -226,7 +226,7 @@ def test_vectors_along_a_path_are_arrows_whose_lengths_are_in_proportion(view):
     vectors = np.zeros((3, 2, 3))
     vectors[:, 0], vectors[:, 1] = [0.0, 0.0, 2.0], [0.5, 0.0, 0.0]
     tab = view(show(flight, jd.repeat(jd.load_params("cf2x"), 2), dt=0.1, arrows=vectors))
-    matrices = np.reshape(tab.run("[...jaxdrones.player.vectors[0].marks.mesh.instanceMatrix.array]"), (3, 2, 4, 4))
+    matrices = np.reshape(tab.run("[...jaxdrones.player.actors.vectors[0].marks.mesh.instanceMatrix.array]"), (3, 2, 4, 4))
     longest = 0.35 * tab.run("jaxdrones.player.stage.radius")
     np.testing.assert_allclose(matrices[..., 3, :3], flight.pos, atol=1e-4)
     np.testing.assert_allclose(matrices[:, 0, 2, :3], [[0, 0, longest]] * 3, atol=1e-5)  # along +z
@@ -244,7 +244,7 @@ def test_a_load_hangs_where_the_log_says_and_a_contact_force_carries_a_drone(vie
     state = state.replace(aux={"payload": PointMass(load, state.vel)})
     tab = view(show(state, params, dt=0.1))
     tab.run("document.getElementById('wrench').click(); jaxdrones.player.draw(0)")
-    matrices = "[...jaxdrones.player.%s.mesh.instanceMatrix.array]"
+    matrices = "[...jaxdrones.player.actors.%s.mesh.instanceMatrix.array]"
     loads, cables, contacts = (
         np.reshape(tab.run(matrices % name), (2, 4, 4))
         for name in ("loads[0].loads", "loads[0].cables", "arrows[0].contact")

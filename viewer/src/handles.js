@@ -14,7 +14,7 @@ export function handles(player) {
       player.seek(time);
       player.following = false;
       player.draw(0);
-      return player.worlds.map((_, w) => player.fleet.positions(w));
+      return player.worlds.map((_, w) => player.actors.fleet.positions(w));
     },
     /** Show nothing but the flight and a clock, by a camera; drones are `scale` times as large as they are, if given. */
     async film(mode, scale) {

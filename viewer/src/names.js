@@ -1,10 +1,33 @@
 // Names in the view: of drones above them, and of worlds that stand side by side. One that would cover another moves up.
 
+import { scratch } from "./flight.js";
+import { theme } from "./theme.js";
+
 const NAMED = 24; // drones in a world of which all have their names in the view
 const HEIGHT = 19; // pixels of a name
 const find = (id) => document.getElementById(id);
 
 export class Names {
+  /** Choose what has a name in a view: drones of the world that is looked at, and worlds side by side. */
+  label({ arrangement, colors, panel, worlds }) {
+    const world = worlds[panel.world], drones = panel.shown.names ? named(world, panel.drone) : [];
+    const labels = drones.map((drone) => ({ drone, text: world.labels[drone], color: colors(world.index, drone) }));
+    if (arrangement.sideBySide && panel.shown.names)
+      worlds.forEach(({ name }, w) => labels.push({ point: arrangement.top.clone().add(arrangement.layout[w].offset), text: name, color: theme.note }));
+    this.list(labels);
+  }
+
+  /** Put the names where their drones are. */
+  follow({ actors, arm, arrangement, panel, stage, time, worlds }) {
+    const world = worlds[panel.world], [row, share] = world.at(time), { p } = scratch, { offset } = arrangement.layout[panel.world];
+    this.place(({ drone, point }) => {
+      if (point) return stage.project(point);
+      if (!world.position(row, share, drone, p) || (panel.mode === "board" && drone === panel.drone)) return null;
+      p.add(offset).setZ(p.z + 1.1 * arm * actors.fleet.scale(world.vehicle[drone], p));
+      return stage.project(p);
+    });
+  }
+
   /** Names of the drones of a world, by `label`: { text, color, drone } or { text, color, point }. */
   list(labels) {
     this.labels = labels.map((label) => {
@@ -35,4 +58,4 @@ export class Names {
 }
 
 /** The drones of a world whose names are shown. */
-export const named = (world, chosen) => (world.n > NAMED ? [chosen] : world.labels.map((_, i) => i));
+const named = (world, chosen) => (world.n > NAMED ? [chosen] : world.labels.map((_, i) => i));

@@ -22,7 +22,7 @@ export class Panel {
     find("speed").value = 1;
     flight.worlds.forEach((world, w) => find("world").add(new Option(world.name, w)));
     for (const box of document.querySelectorAll(".worlds")) box.hidden = flight.worlds.length < 2;
-    document.querySelector(".error").hidden = !flight.ribbon;
+    document.querySelector(".error").hidden = !flight.actors.ribbon;
     for (const box of document.querySelectorAll(".targets")) box.hidden = !flight.worlds.some((world) => world.targets);
     this.listDrones(flight.worlds[0]);
     for (const id of ["speed", "drone", "layout", "trail", "size", "thrust", "wrench", "jets", "error", "targets", "names"])

@@ -178,6 +178,13 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 
+def gap(params: Params, state: State, other: Params, other_state: State) -> Float[Array, ""]:
+    """Distance between the collision shapes of two drones, as their contact sees it, m; negative if they overlap."""
+    first = _body(params, state, jnp.zeros_like(state.pos))
+    second = _body(other, other_state, other_state.pos - state.pos)
+    return -jnp.maximum(jnp.max(_contacts(first, second).depth), jnp.max(_contacts(second, first).depth))
+
+
 class _Body(NamedTuple):
     """Collision shape of a drone and its motion; world frame, with an origin chosen by the caller."""
 

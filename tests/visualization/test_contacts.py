@@ -11,6 +11,7 @@ import jaxdrones as jd
 from jaxdrones.dynamics.contact import rim
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing import Box, Scene
+from jaxdrones.visualization.viewer import contacts
 from jaxdrones.visualization.viewer.contacts import contact_forces
 
 PARAMS = jd.repeat(jd.load_params("cf2x"), 2)
@@ -72,3 +73,37 @@ def test_a_drone_that_lies_on_the_simulated_ground_has_its_force():
     forces = contact_forces(FlightLog(np.arange(1, 201) / 240, **arrays, params=PARAMS))
     np.testing.assert_allclose(forces[-1, 0], [0, 0, WEIGHT], atol=0.02 * WEIGHT)
     assert (forces[:100, 1] == 0).all()  # it falls until then
+
+
+@pytest.mark.slow
+def test_two_drones_that_collide_exert_opposite_forces_while_they_touch():
+    step = jd.make_step(effects=(), pairs=(jd.drone_contact,), dt=1 / 240)
+    rpm = np.asarray(PARAMS.hover_rpm)[:, None] * np.ones((2, 4))
+    start = jd.State.at_rest(jnp.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0]]))
+    start = start.replace(vel=jnp.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]), rpm=jnp.asarray(rpm))
+
+    def hovering(params, memory, state, k):
+        return memory, jnp.asarray(rpm)
+
+    _, states = jax.jit(lambda: jd.rollout(step, hovering, PARAMS, start, None, length=100))()
+    arrays = {name: np.asarray(getattr(states, name)) for name in ("pos", "quat", "vel", "omega", "rpm")}
+    log = FlightLog(np.arange(1, 101) / 240, **arrays, params=PARAMS)
+    forces = contact_forces(log)
+    np.testing.assert_allclose(forces[:, 0], -forces[:, 1], atol=1e-6 * WEIGHT)  # Newton's third law
+    assert (forces[:, 0, 0] <= 0).all() and forces[:, 0, 0].min() < -WEIGHT
+    impulse = np.sum(forces[:, 0, 0]) / 240
+    assert impulse == pytest.approx(float(PARAMS.mass[0] * (states.vel[-1, 0, 0] - 0.5)), rel=0.05)
+    apart = np.linalg.norm(log.pos[:, 1] - log.pos[:, 0], axis=1)
+    assert (apart[forces.any(axis=(1, 2))] < 2 * float(PARAMS.collision_radius[0]) + 6e-3).all()
+    far = dataclasses.replace(log, pos=log.pos + np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
+    assert contact_forces(far) is None  # as of a gust
+
+
+def test_pairs_of_close_points_are_found_once_and_only_in_the_same_row():
+    random = np.random.default_rng(0)
+    row, pos = random.integers(0, 5, 200), random.uniform(0, 1, (200, 3))
+    apart = np.linalg.norm(pos[:, None] - pos, axis=-1)
+    close = np.argwhere(np.tril((apart < 0.15) & (row[:, None] == row), k=-1))
+    found = contacts._close_pairs(row, pos, 0.15)
+    assert {(max(pair), min(pair)) for pair in found.tolist()} == {tuple(pair) for pair in close.tolist()}
+    assert len(found) == len(close) > 10

@@ -21,7 +21,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is Non
 
 SMALLEST = 12  # pixels
 SEEN = """((index) => {
-    const { actors: { fleet }, stage } = jaxdrones.player, { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
+    const { actors: { fleet }, stage } = jaxdrones.player;
+    const { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
     const drawn = [...mesh.geometry.attributes.position.array.slice(place * size, (place + 1) * size)];
     const point = stage.orbit.target.clone(), seen = [];
     for (let k = 0; k < drawn.length; k += 3) seen.push(stage.project(point.fromArray(drawn, k)));
@@ -226,7 +227,9 @@ def test_vectors_along_a_path_are_arrows_whose_lengths_are_in_proportion(view):
     vectors = np.zeros((3, 2, 3))
     vectors[:, 0], vectors[:, 1] = [0.0, 0.0, 2.0], [0.5, 0.0, 0.0]
     tab = view(show(flight, jd.repeat(jd.load_params("cf2x"), 2), dt=0.1, arrows=vectors))
-    matrices = np.reshape(tab.run("[...jaxdrones.player.actors.vectors[0].marks.mesh.instanceMatrix.array]"), (3, 2, 4, 4))
+    matrices = np.reshape(
+        tab.run("[...jaxdrones.player.actors.vectors[0].marks.mesh.instanceMatrix.array]"), (3, 2, 4, 4)
+    )
     longest = 0.35 * tab.run("jaxdrones.player.stage.radius")
     np.testing.assert_allclose(matrices[..., 3, :3], flight.pos, atol=1e-4)
     np.testing.assert_allclose(matrices[:, 0, 2, :3], [[0, 0, longest]] * 3, atol=1e-5)  # along +z
@@ -255,3 +258,15 @@ def test_a_load_hangs_where_the_log_says_and_a_contact_force_carries_a_drone(vie
         where=np.eye(4) < 1
     )  # upwards from the ground; none in the air
     assert "contact force" in tab.run("document.getElementById('legend').textContent")
+
+
+def test_contact_forces_of_a_flight_that_is_running_are_shown_from_the_first_touch_on(view):
+    tab = view(page_of([[0.0, 0.0, 1.0]]))
+    row = "pos: Float32Array.of(0, 0, 0.02), vel: Float32Array.of(0, 0, 0), omega: Float32Array.of(0, 0, 0), "
+    row += "quat: Float32Array.of(0, 0, 0, 1), rpm: Float32Array.of(0, 0, 0, 0)"
+    for time, force in ((0.4, "null"), (0.5, "Float32Array.of(0, 0, 0.2)"), (0.6, "null")):
+        tab.run(f"jaxdrones.player.append({{ t: Float32Array.of({time}), {row}, contacts: {force} }})")
+    tab.press("r")
+    arrow = "jaxdrones.player.draw(0), jaxdrones.player.actors.arrows[0].contact.mesh.instanceMatrix.array[10]"
+    lengths = [tab.run(f"jaxdrones.player.seek({time}), {arrow}") for time in (0.15, 0.45, 0.55, 0.65)]
+    assert [length > 0 for length in lengths] == [False, False, True, False]

@@ -5,7 +5,7 @@ import { extent } from "./solids.js";
 
 const HUGE = 1e6; // m; a drone that is further away, or nowhere, is not shown
 const SAMPLES = 3000; // positions that the camera is fitted to
-const SIZES = { pos: 3, quat: 4, vel: 3, omega: 3, rpm: 4, targets: 3, target_vel: 3, loads: 3 }; // numbers per drone and row
+const SIZES = { pos: 3, quat: 4, vel: 3, omega: 3, rpm: 4, targets: 3, target_vel: 3, loads: 3, contacts: 3 }; // numbers per drone and row
 
 /** Largest horizontal distance of a rotor from the center of mass, m. */
 export const armOf = (vehicle) => Math.max(...vehicle.rotor_pos.map(([x, y]) => Math.hypot(x, y)));
@@ -38,6 +38,7 @@ export class World {
     const count = more.t.length, first = this.rows;
     if (first + count > this.t.length) this.reserve(2 * (first + count));
     this.t.set(more.t, first);
+    if (more.contacts && !this.contacts) this.contacts = new Float32Array(SIZES.contacts * this.n * this.t.length); // the first touch
     for (const [name, size] of Object.entries(SIZES)) {
       if (!this[name]) continue;
       const from = size * this.n * first;

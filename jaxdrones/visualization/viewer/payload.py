@@ -98,8 +98,6 @@ def encode(
             | ({"farthest": _farthest(images.frames)} if kind == "depth" else {})
             for kind, images in record.images.items()
         ]
-        forces = contact_forces(record)
-        world["contacts"] = None if forces is None else arrays.add(forces)
         world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
         worlds.append(world)
     if arrows is not None:
@@ -117,7 +115,7 @@ def encode_rows(record: FlightLog) -> str:
 
 
 def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
-    """Arrays of a flight for the page by name; unknown targets and loads are `None`."""
+    """Arrays of a flight for the page by name; `None` for unknown targets and loads, and without contact."""
     rows: dict[str, Any] = {"t": arrays.add(record.t)}
     for name in ("pos", "quat", "vel", "omega", "rpm"):
         rows[name] = arrays.add(getattr(record, name), _LARGEST_ERROR.get(name, math.inf))
@@ -125,6 +123,8 @@ def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
     for name, values in optional.items():
         known = bool(np.isfinite(values).any())
         rows[name] = arrays.add(values, _LARGEST_ERROR.get(name, math.inf)) if known else None
+    forces = contact_forces(record)
+    rows["contacts"] = None if forces is None else arrays.add(forces)
     return rows
 
 

@@ -36,6 +36,7 @@ MORE = {  # command of a page -> what makes it short
     "train hover --vehicle mine.urdf --resume --budget 50": RESUMED,
     "eval my_policy.py:policy --task hover --set action=position --set reach=0.5 --set tilt=20": "--episodes 4",
     "fly --policy my_policy.py:policy --task hover --set action=position --backend bullet": "--no-figure",
+    "demo --policy my_policy.py:policy --set action=position --set reach=0.5 --set tilt=20": "--no-open",
     "eval any-vehicle --task hover --realistic any": "--episodes 4",
     "eval raptor --task hover --vehicle x500": "--episodes 4",
 }

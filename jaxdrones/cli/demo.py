@@ -10,15 +10,17 @@ from jaxdrones.checks import look_up
 from jaxdrones.cli import fly
 from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.live import add_live
-from jaxdrones.cli.options import add_drones, add_output
-from jaxdrones.cli.policies import open_policy
+from jaxdrones.cli.options import add_drones, add_output, add_set
+from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import print_results
+from jaxdrones.cli.settings import parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
 from jaxdrones.writing import write
 
 _FIRST = "forest"
-_SIMULATED = ("fly it yourself", "fly twenty")  # in the page, listed after the first flight
+_NEXT = ("fly it yourself", "fly twenty", "gates", "race", "recovery", "swap-goals", "thousand drones", "real flight")
+"""Flights that are listed after the first, in this order; the others follow by name."""
 
 
 def add(commands) -> None:
@@ -36,8 +38,11 @@ def add(commands) -> None:
         "--policy",
         type=folder,
         metavar="RUN",
-        help="simulate --drones drones with this policy first: a run of hover for one drone; needs casadi",
+        help="simulate --drones drones with this policy first: a run of hover for one drone; or file.py:name, whose "
+        "code is executed; needs casadi",
     )
+    parser.add_argument("--task", metavar="TASK", help="with file.py:name: task (hover), as for `jaxdrones train`")
+    add_set(parser, "with file.py:name: option of the environment (action, observation, ...)")
     add_drones(parser, 1)
     add_live(parser, "fly FLIGHT now, in place of the page, and show it in the browser in real time")
     add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
@@ -50,13 +55,16 @@ def _demo(options: argparse.Namespace) -> int:
     flight = look_up("flight", options.flight, exhibits)
     if options.drones != 1 and options.policy is None:
         raise UserError(f"--drones {options.drones} is given without --policy; 'fly twenty' simulates twenty drones")
+    if (options.task or options.set) and not (options.policy and is_user_policy(options.policy)):
+        raise UserError("--task and --set are for --policy file.py:name; leave them out, or give such a policy")
     if options.live is not None:
         return _fly(flight, options)
     if options.policy is not None:
-        flight = _own(options.policy, options.drones)
+        flight = _own(options)
     output = options.output or Path("runs") / "demo.html"
     check_writable(output)
-    exhibits = dict(sorted(exhibits.items(), key=lambda named: named[0] not in _SIMULATED))
+    order = {name: place for place, name in enumerate(_NEXT)}
+    exhibits = dict(sorted(exhibits.items(), key=lambda named: order.get(named[0], len(order))))
     exhibits = {flight.name: flight} | exhibits
     write(output, gallery(list(exhibits.values())).encode())
     size = f"{output.stat().st_size / 1e6:.1f} MB"
@@ -80,11 +88,19 @@ def _fly(exhibit: Exhibit, options: argparse.Namespace) -> int:
     return flight.run(flight)
 
 
-def _own(policy: Path, drones: int) -> Exhibit:
+def _own(options: argparse.Namespace) -> Exhibit:
+    """Drones that the page simulates with the policy of a user."""
     from jaxdrones.export import simulation  # needs casadi
 
-    run = open_policy(policy, None, False, {})
+    policy, own = options.policy, is_user_policy(options.policy)
+    task = (options.task or "hover") if own else None
+    run = open_policy(policy, task, False, parse_settings(options.set))
+    words = ["jaxdrones", "fly", "--policy", str(policy), *(["--task", task] if task else [])]
+    command = shlex.join([*words, *(word for x in options.set for word in ("--set", x)), "--live"])
     with run.recipe().env() as env:
-        page = simulation.page(run.policy(env=env), env, str(policy), drones)
-    about = f"Simulated in this page, and flown by the policy of {policy}. Push it."
-    return Exhibit(str(policy), about, f"jaxdrones fly --policy {policy} --live", page.payload)
+        try:
+            page = simulation.page(run.policy(env=env), env, str(policy), options.drones)
+        except NotImplementedError as error:
+            raise UserError(f"{policy} cannot be simulated in a page: {error}; `{command}` flies it") from None
+    about = f"Simulated in this page, and flown by the policy {'' if own else 'of '}{policy}. Push it."
+    return Exhibit(str(policy), about, command, page.payload)

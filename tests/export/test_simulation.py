@@ -146,6 +146,16 @@ def test_a_controller_in_the_page_flies_to_the_goal_and_stays(pilot, made):
     np.testing.assert_allclose(in_node(text, vars(own), made.state, GOAL), rpm, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_a_function_of_a_user_flies_to_the_goal_and_stays():
+    from jaxdrones.export.simulation import simulation
+
+    env = jd.make("hover", action="position", reach=0.5, tilt=20.0)
+    made = simulation(lambda obs: jnp.clip(obs[:, :3] / 0.1, -1, 1), env)
+    found = places(made, "policy", 4000, [0, 0, 0])
+    assert np.linalg.norm(found[0] - GOAL) > 0.3 and np.linalg.norm(found[-1] - GOAL) < 0.03
+
+
 def test_push_mass_and_weight_obey_newton(made):
     """Falling with stopped rotors, and pushed: a = F / m - g, less a little drag."""
     text = (

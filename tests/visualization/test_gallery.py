@@ -14,6 +14,24 @@ from jaxdrones.visualization.viewer.gallery import read_exhibits
 from jaxdrones.visualization.viewer.payload import decode
 
 CHOSEN = "document.querySelector('[aria-current]')"
+OWN = """
+import jax.numpy as jnp
+
+def straight(obs):
+    return jnp.clip(obs[:, :3] / 0.1, -1, 1)
+
+def sorting(obs):
+    return jnp.sort(obs[:, :3], axis=1)
+
+class _Remembering:
+    def initial_hidden_state(self, batch):
+        return jnp.zeros((*batch, 3))
+
+    def act(self, hidden_state, obs):
+        return hidden_state, obs[..., :3]
+
+remembering = _Remembering()
+"""
 EXHIBITS = read_exhibits(assets.folder() / "demo")
 
 
@@ -47,7 +65,8 @@ def test_a_thousand_drones_and_a_real_flight_beside_its_simulation_are_shown():
 def test_the_page_begins_with_the_flight_that_was_asked_for(page):
     data = json.loads(re.search(r'<script id="data" type="application/json">(.*)</script>', page.read_text())[1])
     names = [exhibit["name"] for exhibit in data["exhibits"]]
-    assert names[:3] == ["recovery", "fly it yourself", "fly twenty"] and names[3:] == sorted(names[3:])
+    shown = ["fly it yourself", "fly twenty", "gates", "race", "swap-goals", "thousand drones", "real flight"]
+    assert names[:8] == ["recovery", *shown] and names[8:] == sorted(names[8:])
     assert len(data["exhibits"]) == len(EXHIBITS)
 
 
@@ -62,6 +81,8 @@ def test_an_unknown_flight_is_named(tmp_path, capsys):
         (["real flight", "--live"], "no bundled policy flies 'real flight'"),
         (["forest", "--live", "--output", "page.html"], "leave out --policy and --output"),
         (["--drones", "20"], "without --policy"),
+        (["--task", "hover"], "--task and --set are for --policy file.py:name"),
+        (["--policy", "runs/hover", "--set", "reach=1"], "--task and --set are for --policy file.py:name"),
     ],
 )
 def test_options_that_contradict_each_other_are_named(arguments, message, capsys):
@@ -78,6 +99,27 @@ def test_a_flight_of_the_gallery_is_flown_now(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "open http://127.0.0.1:" in said and "success" in said
     assert list(tmp_path.rglob("log.npz")) != []
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.needs("casadi")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("straight", "wrote demo.html"),
+        ("sorting", "'sort', which has no .*; `jaxdrones fly --policy own.py:sorting --task hover --set"),
+        ("remembering", "the page cannot fly this policy: it has a memory"),
+    ],
+)
+def test_a_policy_of_a_file_flies_in_the_page_or_the_reason_is_named(name, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(OWN)
+    made = main(["demo", "--policy", f"own.py:{name}", "--set", "action=position", "--no-open", "-o", "demo.html"])
+    said = capsys.readouterr()
+    assert re.search(says, said.out + said.err) and made == (0 if name == "straight" else 2)
+    if made == 0:
+        assert "jaxdrones fly --policy own.py:straight --task hover" in (tmp_path / "demo.html").read_text()
 
 
 @pytest.mark.slow

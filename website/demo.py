@@ -49,6 +49,8 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "hover": {},
 }
 """Task -> options."""
+_SHOWN: dict[str, dict[str, bool]] = {"wake": {"jets": True}}
+"""Task -> what the page shows from the start."""
 _OWN, _TWENTY, _REAL, _WORD = "fly it yourself", "fly twenty", "real flight", "thousand drones"
 _RECORDED = "B10_lissajous_slow_rep1"
 _WORD_RATE = 1.5  # rows per second
@@ -137,7 +139,7 @@ def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
         about = f"{env.task.summary[0].upper()}{env.task.summary[1:]}. {_success(task)}"
     (record,) = records_of(episode, dict.fromkeys(("params", "dt", "targets", "labels", "images")))
     record = _thinned(record)
-    payload = encode([record], [task], task, layout="alone", play=True)
+    payload = encode([record], [task], task, layout="alone", play=True, **_SHOWN.get(task, {}))
     team = "".join(f" --{name} {value}" for name, value in options.items())
     return Exhibit(task, about, f"jaxdrones fly --policy {task}{team} --live", payload)
 

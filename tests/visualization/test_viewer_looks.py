@@ -180,6 +180,42 @@ def test_names_find_places_wherever_their_drones_are(view):
         assert (beside | above | np.eye(12, dtype=bool)).all()
 
 
+def test_names_of_drones_in_the_picture_stay_in_it_and_leave_the_title_free(view):
+    tab = view(page_of([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [2.0, 0.0, 1.0]], title="A title of some words"))
+    places = "[[2, 3], [60, 20], [1095, 6]]"
+    tab.run(f"jaxdrones.player.names.place(({{ drone }}) => {places}[drone])")
+    boxes = np.array(tab.run(BOXES))[:5]  # title, legend, names
+    assert (boxes[:, 0] >= 0).all() and (boxes[:, 1] <= 1100).all() and (boxes[:, 2] >= 0).all()
+    for i, (left, right, top, bottom) in enumerate(boxes):
+        others = np.delete(boxes, i, axis=0)
+        covers = (others[:, 0] < right) & (others[:, 1] > left) & (others[:, 2] < bottom) & (others[:, 3] > top)
+        assert not covers.any()
+
+
+def test_a_flight_far_above_the_ground_fills_the_picture(view):
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    tab = view(page_of(np.stack([np.cos(angles), np.sin(angles), 0 * angles + 1.5], axis=-1)), (640, 360))
+    tab.run("jaxdrones.film('orbit', 1)")
+    tab.run("jaxdrones.frameAt(0.1, 0)")
+    seen = np.concatenate([tab.run(f"{SEEN}({drone})") for drone in range(8)])
+    assert np.ptp(seen[:, 0]) > 0.4 * 640 and 0.3 * 360 < seen[:, 1].mean() < 0.7 * 360
+
+
+def test_a_target_is_as_large_as_its_drone_would_be_there_and_is_seen_behind_obstacles(view):
+    trunk = Scene.of(Cylinder(pos=(9.5, 0.0, 1.0), radius=0.2, height=2.0))
+    flight = jax.tree.map(lambda x: jnp.stack([x] * 3), jd.State.at_rest(jnp.array([[0.0, 0.0, 1.0]])))
+    page = show(flight, jd.repeat(jd.load_params("cf2x"), 1), dt=0.1, targets=np.array([[10.0, 0.0, 1.0]]), scene=trunk)
+    tab = view(page)
+    arrows, point = "jaxdrones.player.actors.arrows[0]", "jaxdrones.player.stage.orbit.target.clone().set(10, 0, 1)"
+    for name in ("targets", "insides"):
+        drawn = np.reshape(tab.run(f"[...{arrows}.{name}.mesh.instanceMatrix.array]"), (4, 4))
+        np.testing.assert_allclose(drawn[3, :3], [10, 0, 1], atol=1e-4)
+        scale = tab.run(f"jaxdrones.player.actors.fleet.scale(0, {point})")
+        assert drawn[0, 0] == pytest.approx(0.55 * scale * float(jd.load_params("cf2x").arm), rel=1e-3)
+    assert tab.run(f"{arrows}.insides.mesh.material.depthTest") is False
+    assert "◇ target" in tab.run("document.getElementById('legend').textContent")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_texts_stand_out_from_the_page(view, scheme):
     tab = view(page_of([[0.0, 0.0, 1.0]]))

@@ -11,6 +11,8 @@ const UP = new Vector3(0, 0, 1);
 export const THRUST = "#e69f00", FORCE = "#d55e00", TORQUE = "#0072b2", CONTACT = "#009e73";
 const THRUST_ARMS = 1.6; // length of the arrow of a rotor that carries its quarter of the weight, arms
 const FORCE_ARMS = 3; // of a resultant or contact force that equals the weight
+const TARGET_ARMS = 0.55; // half the height of the mark of a target, as large as its drone would be drawn there
+const BEHIND = { transparent: true, opacity: 0.3, depthTest: false, depthWrite: false };
 const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 
 /** Instances that are set anew in every frame. */
@@ -63,7 +65,8 @@ export class Arrows {
     this.torque = new Marks(stage, arrowShape(), arrowMaterial(TORQUE), world.n);
     this.contact = new Marks(stage, arrowShape(), arrowMaterial(CONTACT), world.n);
     this.targets = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial({ wireframe: true }), world.n);
-    world.labels.forEach((_, i) => this.targets.mesh.setColorAt(i, new Color(colors(i))));
+    this.insides = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial(BEHIND), world.n); // also seen behind obstacles
+    for (const { mesh } of [this.targets, this.insides]) world.labels.forEach((_, i) => mesh.setColorAt(i, new Color(colors(i))));
   }
 
   show(time, shown, { hidden, ghost, offset }, fleet) {
@@ -92,8 +95,9 @@ export class Arrows {
         this.torque.arrow(i, p, w, there ? (TORQUE_ARMS * arm * w.length()) / (0.01 * weight * this.arms[i]) : 0, 0.13 * arm);
       }
       if (targets) {
-        const size = 0.55 * arm * (ghost ? 0.6 : 1), known = world.target(row, i, v);
-        this.targets.mesh.setMatrixAt(i, known ? this.targets.matrix.compose(v.add(offset), r.identity(), w.set(size, size, size)) : NOWHERE);
+        const known = world.target(row, i, v), size = TARGET_ARMS * this.arms[i] * fleet.scale(world.vehicle[i], v.add(offset)) * (ghost ? 0.6 : 1);
+        const matrix = known ? this.targets.matrix.compose(v, r.identity(), w.set(size, size, size)) : NOWHERE;
+        for (const { mesh } of [this.targets, this.insides]) mesh.setMatrixAt(i, matrix);
       }
     }
     this.thrust.done(thrust);
@@ -101,5 +105,6 @@ export class Arrows {
     this.torque.done(wrench);
     this.contact.done(wrench);
     this.targets.done(targets);
+    this.insides.done(targets);
   }
 }

@@ -1,10 +1,13 @@
-// Names in the view: of drones above them, and of worlds that stand side by side. One that would cover another moves up.
+// Names in the view: of drones above them, and of worlds that stand side by side. One that would cover another
+// or the title moves up, or down where there is no room above.
 
 import { scratch } from "./flight.js";
 import { theme } from "./theme.js";
 
 const NAMED = 24; // drones in a world of which all have their names in the view
 const HEIGHT = 19; // pixels of a name
+const ABOVE = 4; // pixels between a name and what it names
+const HIGHEST = HEIGHT + ABOVE + 2; // pixels from the top of the picture
 const find = (id) => document.getElementById(id);
 
 export class Names {
@@ -40,18 +43,28 @@ export class Names {
     for (const label of this.labels) label.width = label.element.offsetWidth;
   }
 
-  /** Put every name where `at(label)` says, in pixels, or hide it where that is null. */
+  /** Put every name where `at(label)` says, in pixels, or hide it where that is null; inside the picture, beside the title. */
   place(at) {
-    const taken = [], placed = this.labels.map((label) => ({ label, spot: at(label) }));
+    const placed = this.labels.map((label) => ({ label, spot: at(label) })), picture = find("stage").clientWidth;
+    const { offsetLeft, offsetTop, offsetWidth, offsetHeight } = find("title");
+    const taken = [{ x: offsetLeft + offsetWidth / 2, y: offsetTop + offsetHeight + ABOVE, width: offsetWidth }];
     placed.sort((a, b) => (b.spot?.[1] ?? 0) - (a.spot?.[1] ?? 0));
     for (const { label: { element, width }, spot } of placed) {
       element.hidden = !spot;
       if (!spot) continue;
-      let [x, y] = spot;
-      const covers = (other) => Math.abs(x - other.x) < (width + other.width) / 2 + 2 && Math.abs(y - other.y) < HEIGHT - 0.5; // pixels, beyond rounding
-      for (let other; (other = taken.find(covers)); ) y = other.y - HEIGHT;
+      const side = width / 2 + 2, seen = spot[0] >= 0 && spot[0] <= picture && spot[1] >= 0;
+      const x = seen ? Math.min(Math.max(spot[0], side), Math.max(side, picture - side)) : spot[0];
+      const first = seen ? Math.max(spot[1], HIGHEST) : spot[1];
+      const free = (step) => {
+        const covers = (other) => Math.abs(x - other.x) < (width + other.width) / 2 + 2 && Math.abs(y - other.y) < HEIGHT - 0.5; // pixels, beyond rounding
+        let y = first;
+        for (let other; (other = taken.find(covers)); ) y = other.y + step;
+        return y;
+      };
+      let y = free(-HEIGHT);
+      if (seen && y < HIGHEST) y = free(HEIGHT);
       taken.push({ x, y, width });
-      const transform = `translate(${Math.round(x)}px, ${Math.round(y - 4)}px) translate(-50%, -100%)`;
+      const transform = `translate(${Math.round(x)}px, ${Math.round(y - ABOVE)}px) translate(-50%, -100%)`;
       if (element.style.transform !== transform) element.style.transform = transform;
     }
   }

@@ -32,7 +32,7 @@ export class Player {
     this.actors = new Actors(this.stage, this.worlds, header.vehicles, this.colors);
     this.arrangement = new Arrangement(this.stage, this.worlds, header.scenes);
     this.panel = new Panel(this, this);
-    find("error").checked = Boolean(header.error);
+    for (const id of ["error", "jets"]) find(id).checked = Boolean(header[id]);
     this.history = header.history && new History(header.history, (w) => this.chooseWorld(w));
     const first = this.worlds[0];
     this.panel.set("trail", first.n > 60 ? "1" : "Infinity");

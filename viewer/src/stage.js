@@ -10,7 +10,7 @@ import { theme } from "./theme.js";
 const SUN = new Vector3(-0.45, -0.35, 1); // direction, behind the camera
 const SHADED = 1.8; // how far shadows of obstacles are drawn, over the radius of the flight
 const VIEW = new Vector3(-0.62, -0.72, 0.34).normalize(); // from the middle of the flight to the camera
-const LOW = 1; // height above the ground, over its extent, up to which a flight is shown with its shadows
+const LOW = 0.3; // height above the ground, over its extent, up to which a flight is shown with its shadows
 const SLOWEST = 1 / 32; // s a frame may take before the resolution falls
 const COARSEST = 0.25; // of the full resolution
 const SETTLING = 3; // frames after a change that are not counted

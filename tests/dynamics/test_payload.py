@@ -1,12 +1,12 @@
 """A load on cables swings as a pendulum, keeps momentum and energy, and weighs on the drones that carry it."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.dynamics.payload import LARGEST_STEP
@@ -32,6 +32,10 @@ def flown(step, params, state, seconds, command=None):
     """The end of a flight at constant rotor speeds, by default those of the start, and all its states."""
     command = state.rpm if command is None else command
     return jd.rollout(step, lambda p, m, s, k: (m, command), params, state, None, round(seconds / step.period))
+
+
+fly = partial(jit_unoptimized, static_argnums=(0, 3))(flown)
+tensions = jit_unoptimized(jax.vmap(jax.vmap(jd.cable_tension), (None, 0)))
 
 
 def heavy(params):
@@ -68,11 +72,12 @@ def tossed(step, params, shared):
     """Drones that turn and drift, the load moving below them on cables that become taut."""
     n = len(params.mass)
     state = hovering(step, params, ABOVE[:n])
-    key = jax.random.split(jax.random.key(3), 3)
-    state = state.replace(vel=0.3 * jax.random.normal(key[0], (n, 3)), omega=2 * jax.random.normal(key[1], (n, 3)))
-    return with_load(state, vel=0.5 * jax.random.normal(key[2], (1 if shared else n, 3)))
+    rng = np.random.default_rng(3)
+    vel, omega = (jnp.array(size * rng.normal(size=(n, 3)), state.vel.dtype) for size in (0.3, 2.0))
+    return with_load(state.replace(vel=vel, omega=omega), vel=0.5 * rng.normal(size=(1 if shared else n, 3)))
 
 
+@partial(jit_unoptimized, static_argnums=2)
 def energy(params, state, shared):
     """Kinetic and potential energy of drones, cables and loads, J."""
     own, load = params.aux["payload"], state.aux["payload"]
@@ -85,6 +90,11 @@ def energy(params, state, shared):
     return (kinetic + jnp.sum(own.stiffness * stretch**2)) / 2 + lifted
 
 
+@partial(jit_unoptimized, static_argnums=2)
+def energies(params, states, shared):
+    return jax.vmap(lambda state: energy.__wrapped__(params, state, shared))(states)
+
+
 @pytest.mark.parametrize("degrees", [2, 90])
 @each_integrator
 def test_a_load_below_a_fixed_drone_swings_with_the_period_of_a_pendulum(integrator, degrees):
@@ -95,7 +105,7 @@ def test_a_load_below_a_fixed_drone_swings_with_the_period_of_a_pendulum(integra
     step = make_step(integrator=integrator, dt=1 / 1000)
     params = jd.with_payload(heavy(team(1)), MASS, 1.0, stretch=0.001, damping_ratio=0.0)
     angle = np.radians(degrees)
-    _, states = flown(step, params, swinging(step, params, angle, 1.0), 4.8)
+    _, states = fly(step, params, swinging(step, params, angle, 1.0), 4.8)
     x = np.asarray(states.aux["payload"].pos[:, 0, 0] - states.pos[:, 0, 0])
     crossings = np.flatnonzero(x[:-1] * x[1:] < 0)
     times = (crossings + 1 + x[crossings] / (x[crossings] - x[crossings + 1])) * step.dt
@@ -114,7 +124,7 @@ def test_momentum_of_drones_and_loads_is_constant_without_gravity(shared, integr
     params = weightless(jd.with_payload(team(3), MASS, 0.4, anchor=(0.01, 0, -0.01), cables=3 if shared else 1))
     step = make_step(shared, integrator)
     start = tossed(step, params, shared).replace(rpm=jnp.zeros((3, 4)))
-    _, states = flown(step, params, start, 1.0)
+    _, states = fly(step, params, start, 1.0)
 
     def momentum(state):
         own = jnp.sum(params.mass[:, None] * state.vel, axis=0)
@@ -122,7 +132,9 @@ def test_momentum_of_drones_and_loads_is_constant_without_gravity(shared, integr
 
     exchanged = MASS * np.abs(states.aux["payload"].vel[-1] - start.aux["payload"].vel).max()
     assert exchanged > 1e-3
-    np.testing.assert_allclose(jax.vmap(momentum)(states), momentum(start)[None].repeat(250, 0), atol=1e-3 * exchanged)
+    np.testing.assert_allclose(
+        jit_unoptimized(jax.vmap(momentum))(states), momentum(start)[None].repeat(250, 0), atol=1e-3 * exchanged
+    )
 
 
 @shared_or_not
@@ -131,7 +143,7 @@ def test_angular_momentum_of_drones_and_loads_is_constant_without_gravity(shared
     params = weightless(jd.with_payload(team(3), MASS, 0.4, anchor=(0.01, 0, -0.02), cables=3 if shared else 1))
     step = make_step(shared, jd.rk4)
     start = tossed(step, params, shared).replace(rpm=jnp.zeros((3, 4)))
-    _, states = flown(step, params, start, 1.0)
+    _, states = fly(step, params, start, 1.0)
 
     def momentum(state):
         spin = jax.vmap(jd.rotation.rotate)(state.quat, params.inertia * state.omega)
@@ -141,7 +153,9 @@ def test_angular_momentum_of_drones_and_loads_is_constant_without_gravity(shared
 
     spins = params.inertia[None] * states.omega
     assert np.abs(spins[-1] - spins[0]).max() > 2e-5
-    np.testing.assert_allclose(jax.vmap(momentum)(states), momentum(start)[None].repeat(250, 0), atol=4e-6)
+    np.testing.assert_allclose(
+        jit_unoptimized(jax.vmap(momentum))(states), momentum(start)[None].repeat(250, 0), atol=4e-6
+    )
 
 
 @each_integrator
@@ -152,11 +166,11 @@ def test_damped_cables_never_add_energy(shared, integrator):
     step = make_step(shared, integrator, dt=1 / 1000)
     start = tossed(step, params, shared)
     start = start.replace(rpm=jnp.zeros((3, 4)), omega=0.2 * start.omega)
-    _, states = flown(step, params, start, 1.5)
-    tension = jax.vmap(lambda s: jax.vmap(jd.cable_tension)(params, s))(states)
+    _, states = fly(step, params, start, 1.5)
+    tension = tensions(params, states)
     assert 0.05 < np.mean(tension > 0) < 0.95
-    of_time = np.asarray(jax.vmap(lambda s: energy(weightless(params), s, shared))(states))
-    still = jax.vmap(lambda s: energy(params, s, shared))(states)
+    of_time = np.asarray(energies(weightless(params), states, shared))
+    still = energies(params, states, shared)
     scale = of_time.max()
     assert np.diff(still).max() < 3e-4 * scale
     assert still[-1] < still[0] - 0.01 * float(energy(weightless(params), start, shared))
@@ -178,8 +192,8 @@ def test_energy_is_conserved_to_the_order_of_the_integrator_without_damping(shar
             pulled = start.aux["payload"]
             start = with_load(start.replace(rpm=jnp.zeros((3, 4))), vel=jnp.array([[0.1, 0.05, -0.3]]))
             start = with_load(start, pos=pulled.pos - jnp.array([[0, 0, 0.02]]))
-            states = flown(step, params, start, 0.02)[1]
-            taut = jax.vmap(lambda s: jax.vmap(jd.cable_tension)(params, s))(states)
+            states = fly(step, params, start, 0.02)[1]
+            taut = tensions(params, states)
             assert np.all(taut > 0)
             return abs(
                 float(energy(params, jax.tree.map(lambda x: x[-1], states), shared) - energy(params, start, shared))
@@ -193,7 +207,7 @@ def test_a_swing_keeps_its_amplitude_at_the_longest_step():
     """Explicit Euler would gain a tenth of the energy a second at 1/100 s."""
     step = make_step(dt=LARGEST_STEP)
     params = jd.with_payload(heavy(team(1)), MASS, 0.5)
-    _, states = flown(step, params, swinging(step, params, 0.5, 0.505), 10.0)
+    _, states = fly(step, params, swinging(step, params, 0.5, 0.505), 10.0)
     x = np.abs(np.asarray(states.aux["payload"].pos[:, 0, 0] - states.pos[:, 0, 0]))
     assert 0.97 < x[-150:].max() / x[:150].max() < 1.005
 
@@ -207,11 +221,11 @@ def test_a_hovering_drone_carries_the_weight_of_its_load(shared, integrator):
     step = make_step(shared, integrator)
     start = hovering(step, params, 1e-3 * ABOVE + np.array([[0, 0, 2]]))
     rpm = jnp.sqrt((params.mass + MASS) * params.gravity / (4 * params.kf))[:, None] * jnp.ones(4)[None]
-    end, _ = flown(step, params, start, 2.0, rpm)
+    end, _ = fly(step, params, start, 2.0, rpm)
     np.testing.assert_allclose(end.pos, start.pos, atol=2e-3)
     np.testing.assert_allclose(end.aux["payload"].pos, start.aux["payload"].pos, atol=2e-3)
     np.testing.assert_allclose(jax.vmap(jd.cable_tension)(params, end), MASS * params.gravity, rtol=5e-3)
-    sunk, _ = flown(step, params, start, 1.0)
+    sunk, _ = fly(step, params, start, 1.0)
     expected = -MASS / (MASS + params.mass[0]) * params.gravity[0] / 2
     np.testing.assert_allclose(sunk.pos[:, 2] - start.pos[:, 2], expected, rtol=0.02)
 
@@ -221,12 +235,12 @@ def test_a_slack_cable_exerts_no_force_and_the_load_falls_freely():
     step = make_step()
     start = hovering(step, params)
     start = with_load(start, pos=start.pos - jnp.array([[0, 0, 0.3]]), vel=jnp.array([[0.2, 0, 0.0]]))
-    _, states = flown(step, params, start, 0.18)
+    _, states = fly(step, params, start, 0.18)
     t = 0.18
     np.testing.assert_allclose(states.vel[-1], 0, atol=1e-5)
     expected = start.aux["payload"].pos[0] + jnp.array([0.2 * t, 0, -9.8 * t**2 / 2])
     np.testing.assert_allclose(states.aux["payload"].pos[-1, 0], expected, atol=4e-3)
-    assert not np.any(jax.vmap(lambda s: jax.vmap(jd.cable_tension)(params, s))(states))
+    assert not np.any(tensions(params, states))
 
 
 def test_the_tension_is_that_of_the_formula_and_continuous_where_the_cable_becomes_taut():
@@ -265,9 +279,9 @@ def test_gradients_through_the_cables_are_those_of_central_differences(shared):
 
     with jax.enable_x64(True):
         params, start = jax.tree.map(lambda x: jnp.asarray(x, float), (params, start))
-        value, h = jax.jit(miss), 1e-5
-        measured = [(value(h * e) - value(-h * e)) / (2 * h) for e in jnp.eye(7)]
-        exact = jax.jit(jax.grad(miss))(jnp.zeros(7))
+        value, h = jit_unoptimized(miss), 1e-5
+        measured = [(value(h * e) - value(-h * e)) / (2 * h) for e in np.eye(7)]
+        exact = jit_unoptimized(jax.grad(miss))(jnp.zeros(7))
     assert np.all(np.abs(exact) > 1e-3)
     np.testing.assert_allclose(exact, measured, rtol=2e-4)
     params, start = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (params, start))
@@ -309,7 +323,7 @@ def test_the_rows_of_a_shared_load_stay_equal_and_it_starts_near_rest():
     tension = jax.vmap(jd.cable_tension)(params, start)
     height = start.pos[0, 2] - start.aux["payload"].pos[0, 2]
     np.testing.assert_allclose(tension * height / 0.5, MASS * 9.8, rtol=0.02)
-    load = flown(step, params, tossed(step, params, True), 1.0)[0].aux["payload"]
+    load = fly(step, params, tossed(step, params, True), 1.0)[0].aux["payload"]
     for x in (load.pos, load.vel):
         np.testing.assert_array_equal(x, np.broadcast_to(x[:1], x.shape))
 
@@ -360,7 +374,7 @@ def test_a_flight_converges_to_that_of_udaan_as_the_cable_stretches_less(stretch
         params = jd.with_payload(drone, 0.008, 0.5, stretch=stretch, damping_ratio=0.2)
         step = jd.make_step(effects=(push, jd.cable), models=(jd.payload(),), integrator=jd.rk4, dt=1 / 1000)
         start = step.init(params, jd.State.at_rest([[0.0, 0, 0]]))
-        _, states = flown(step, params, with_load(start, 0.5 * (1 + stretch) * down[None], vel[None]), 2.0)
+        _, states = fly(step, params, with_load(start, 0.5 * (1 + stretch) * down[None], vel[None]), 2.0)
     flight = np.concatenate([states.pos[499::500, 0], states.aux["payload"].pos[499::500, 0]], axis=1)
     np.testing.assert_allclose(flight, UDAAN, atol=2.1 * stretch * 0.5)
 

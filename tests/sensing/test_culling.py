@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
@@ -36,7 +37,8 @@ def looking(yaw: float) -> State:
     return State.at_rest(jnp.array([[0.0, 0.0, 2.0]])).replace(quat=quat[None])
 
 
-def hits(scene: Scene, state: State) -> np.ndarray:
+@jit_unoptimized
+def hits(scene: Scene, state: State) -> jax.Array:
     """(k, h, w) depth at which each pixel's ray enters each tree; infinity for a miss."""
     view = view_of(CAMERA, *jax.tree.map(lambda x: x[0], (PARAMS, state)))
     ones = jnp.ones_like(view.u + view.v)
@@ -49,7 +51,7 @@ def hits(scene: Scene, state: State) -> np.ndarray:
         return jnp.where((last >= first) & (first < CAMERA.far), first, jnp.inf)
 
     first = jax.lax.map(one, scene.shapes(view.eye.dtype)[0].replace(active=None))
-    return np.asarray(first).reshape(-1, *reversed(CAMERA.resolution))
+    return first.reshape(-1, *reversed(CAMERA.resolution))
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
@@ -60,7 +62,7 @@ def test_among_two_thousand_trees_a_pixel_sees_the_nearest_of_all(worlds):
     look = jax.jit(jax.vmap(lambda state: render(scene, PARAMS, state, CAMERA)))
     images = look(jax.tree.map(lambda *x: jnp.stack(x), *states))
     for i, state in enumerate(states):
-        first = hits(scene, state)
+        first = np.asarray(hits(scene, state))
         nearest = np.min(first, axis=0)
         assert 0.2 < np.mean(nearest < np.inf) < 0.95
         np.testing.assert_allclose(images.depth[i, 0], np.minimum(nearest, CAMERA.far), rtol=1e-9)

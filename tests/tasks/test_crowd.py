@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones import rotation
 from jaxdrones.envs import make
@@ -20,7 +21,7 @@ KEYS = jax.random.split(jax.random.key(0), 20)
 )
 def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(drones, density):
     env = make("crowd", drones=drones, density=density)
-    _, worlds = jax.vmap(env.reset)(KEYS)
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(KEYS)
     side = (drones / density) ** (1 / 3)
     radius = float(env.params.collision_radius[0])
     for places in (np.asarray(worlds.drones.pos), np.asarray(worlds.variables["goal"])):
@@ -35,7 +36,7 @@ def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(dro
 @pytest.mark.float32
 def test_random_boxes_are_narrow_or_long():
     env = make("crowd", random_box=True)
-    _, worlds = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 200))
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))
     places = np.concatenate([worlds.drones.pos, worlds.variables["goal"]], axis=1)
     sides = np.ptp(places, axis=1)
     assert sides.min() > 0.3 and 1.0 < np.median(sides) < 2.0
@@ -46,7 +47,7 @@ def test_random_boxes_are_narrow_or_long():
 @pytest.mark.float32
 def test_among_balls_starts_and_goals_are_free_and_a_ball_touches():
     env = make("crowd", drones=8, obstacles=1.0)
-    _, worlds = jax.vmap(env.reset)(KEYS)
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(KEYS)
     radius = float(env.params.collision_radius[0])
     balls = np.asarray(worlds.scene.spheres.pos)
     assert balls.shape == (20, 8, 3) and np.all(np.abs(balls - [0, 0, FLOOR + 1]) <= 1)
@@ -65,7 +66,7 @@ def test_among_balls_starts_and_goals_are_free_and_a_ball_touches():
 @pytest.mark.parametrize("heading", [0.0, 0.5, np.pi, -2.0])
 def test_the_heading_costs_one_minus_its_cosine_also_of_a_tilted_drone(heading):
     env = make("crowd", drones=2)
-    _, world = env.reset(KEYS[0])
+    _, world = jit_unoptimized(env.reset)(KEYS[0])
     quat = jnp.stack([rotation.from_rpy(jnp.array([r, p, heading])) for r, p in ((0.0, 0.0), (0.3, 0.5))])
     world = world.replace(drones=world.drones.replace(quat=quat))
     np.testing.assert_allclose(shaping.heading(env.task, world), 1 - np.cos(heading), atol=0.015)
@@ -74,7 +75,7 @@ def test_the_heading_costs_one_minus_its_cosine_also_of_a_tilted_drone(heading):
 def test_drones_that_pass_between_two_control_steps_have_touched():
     """Four meters a second: 16 cm between two control steps, more than the two drones are wide."""
     env = make("crowd", drones=3)
-    _, world = env.reset(jax.random.key(0))
+    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
     radius = float(env.params.collision_radius[0])
     for gap, touches in ((1.9, True), (2.1, False)):
         before = jnp.array([[0.0, 0, 3], [0.16, gap * radius, 3], [0, 3, 3]])
@@ -93,7 +94,7 @@ def test_drones_that_pass_between_two_control_steps_have_touched():
 def test_a_drone_that_left_the_world_touches_nobody_on_the_way():
     """Drones that leave are moved far along x, here past another one."""
     env = make("crowd", drones=3)
-    _, world = env.reset(jax.random.key(0))
+    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
     pos = jnp.array([[0.0, 0, 3], [1.0, 0, 3], [0, 3, 3]])
     left = world.replace(
         drones=world.drones.replace(pos=pos.at[0, 0].set(1e4)),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.envs import make
@@ -27,13 +28,13 @@ def load_of(worlds):
 )
 def test_loads_start_near_the_curve_below_their_drones_on_cables_that_are_not_stretched(task, drones):
     env = make(task, drones=drones)
-    _, worlds = jax.vmap(env.reset)(KEYS)
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(KEYS)
     pos, load = np.asarray(worlds.drones.pos), np.asarray(load_of(worlds).pos)
     away = np.linalg.norm(pos - load, axis=-1)
     assert away.max() < 0.501 and away.min() > (0.499 if task == "sling" else 0.4)
-    error = jax.vmap(env.task.measure)(worlds)["error"]
+    error = jit_unoptimized(jax.vmap(env.task.measure))(worlds)["error"]
     assert 0.02 < np.median(error) and np.max(error) < 0.4
-    target = jax.vmap(env.task.target_now)(worlds)
+    target = jit_unoptimized(jax.vmap(env.task.target_now))(worlds)
     assert np.ptp(np.asarray(target.pos)[:, 0, 0]) > 1.5
     np.testing.assert_allclose(load_of(worlds).vel, target.vel, atol=1e-5)
     if task == "transport":
@@ -56,7 +57,7 @@ def test_the_mass_of_a_load_is_the_share_of_its_drones(task, drones, mass):
 def test_the_swing_is_the_angle_from_the_vertical_to_the_middle_of_the_team():
     for task, drones in (("sling", 1), ("transport", 3)):
         env = make(task, drones=drones)
-        _, world = env.reset(jax.random.key(0))
+        _, world = jit_unoptimized(env.reset)(jax.random.key(0))
         middle = jnp.mean(world.drones.pos, axis=0)
         for degrees in (0.0, 20.0, 90.0, 135.0):
             angle = np.radians(degrees)
@@ -69,7 +70,7 @@ def test_the_swing_is_the_angle_from_the_vertical_to_the_middle_of_the_team():
 def test_drones_at_their_places_have_no_penalty_and_carry_the_load_at_rest():
     """The places of a team are equal cables apart from the load, and its thrust holds a load where it is."""
     env = make("transport", drones=3)
-    _, world = env.reset(jax.random.key(0))
+    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
     places = world.drones.pos + env.task.observations["place"].observe(env.task, world)
     apart = places - load_of(world).pos
     np.testing.assert_allclose(jnp.linalg.norm(apart, axis=-1), 0.5, rtol=1e-5)

@@ -7,6 +7,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from benchmarks import leaderboard, tables
 from benchmarks.leaderboard_pilots import PILOTS, Controller, controller
@@ -19,7 +20,7 @@ SETTINGS = ["--quick", "--pilot", "nothing", "geometric", "--scenario", "hover"]
 def starts(pilot: str, seed: int, count: int = 8) -> np.ndarray:
     env = PILOTS[pilot].env(SCENARIOS["hover"])
     keys = jax.random.split(jax.random.key(seed), count)
-    drones = jax.vmap(lambda key: env.reset(jax.random.split(key)[0])[1].drones)(keys)
+    drones = jit_unoptimized(jax.vmap(lambda key: env.reset(jax.random.split(key)[0])[1].drones))(keys)
     return np.concatenate([np.asarray(x).reshape(count, -1) for x in (drones.pos, drones.quat, drones.vel)], axis=1)
 
 

@@ -67,8 +67,8 @@ class Fixed(PyTreeNode):
 
 def flown(env, action, steps=STEPS):
     """Worlds and answers of an episode, the drones' actions being constant."""
-    step = jax.jit(env.step)
-    _, world = env.reset(KEY)
+    step = jit_unoptimized(env.step)
+    _, world = jit_unoptimized(env.reset)(KEY)
     answers = []
     for _ in range(steps):
         _, world, *answer = step(KEY, world, Fixed(jnp.asarray(action, float))(None))
@@ -120,26 +120,29 @@ def test_a_drone_that_left_acts_on_no_other(backend):
         envs.make(task, **options) as pair,
         envs.make(column(1, terminations={}, control_hz=50.0).task, **options) as single,
     ):
-        _, world = pair.reset(KEY)
-        _, alone = single.reset(KEY)
-        _, world, *_ = pair.step(KEY, world, jnp.zeros((2, 4)))
-        _, alone, *_ = single.step(KEY, alone, jnp.zeros((1, 4)))
+        compiled = jit_unoptimized if backend == "explicit" else lambda function: function
+        step, step_alone = compiled(pair.step), compiled(single.step)
+        _, world = compiled(pair.reset)(KEY)
+        _, alone = compiled(single.reset)(KEY)
+        _, world, *_ = step(KEY, world, jnp.zeros((2, 4)))
+        _, alone, *_ = step_alone(KEY, alone, jnp.zeros((1, 4)))
         assert world.drones.vel[0, 2] < alone.drones.vel[0, 2] - 1e-3  # in the wake
         alone = alone.replace(drones=jax.tree.map(lambda x: x[:1], world.drones))
         for _ in range(3):
-            _, world, *_ = pair.step(KEY, world, jnp.zeros((2, 4)))
-            _, alone, *_ = single.step(KEY, alone, jnp.zeros((1, 4)))
+            _, world, *_ = step(KEY, world, jnp.zeros((2, 4)))
+            _, alone, *_ = step_alone(KEY, alone, jnp.zeros((1, 4)))
             np.testing.assert_allclose(world.drones.pos[0], alone.drones.pos[0], atol=1e-6)
             np.testing.assert_allclose(world.drones.vel[0], alone.drones.vel[0], atol=1e-5)
 
 
 def test_a_state_that_is_not_finite_stays_with_its_drone():
     env = column(terminations={"over": lambda task, world: ~jnp.isfinite(world.drones.pos[:, 2])})
-    _, world = env.reset(KEY)
+    step = jit_unoptimized(env.step)
+    _, world = jit_unoptimized(env.reset)(KEY)
     broken = world.replace(drones=world.drones.replace(vel=world.drones.vel.at[0].set(jnp.nan)))
-    _, world, *_, info = env.step(KEY, broken, jnp.zeros((2, 4)))
+    _, world, *_, info = step(KEY, broken, jnp.zeros((2, 4)))
     assert list(np.asarray(info["terminated"])) == [True, False]
-    _, world, reward, *_ = env.step(KEY, world, jnp.zeros((2, 4)))
+    _, world, reward, *_ = step(KEY, world, jnp.zeros((2, 4)))
     assert np.all(np.isfinite(world.drones.pos)) and list(np.asarray(reward)) == [0, 1]
 
 
@@ -178,6 +181,7 @@ def test_ppo_does_not_learn_from_steps_after_the_end_of_a_drone():
     gone = np.asarray(trajectory.was_done)
     assert 0 < gone.sum() < gone.size / 2
 
+    @jit_unoptimized
     def of(trajectory):
         batch = batch_of(config, state, None, trajectory, jnp.zeros((2, 2, 2, 4)), ends_alone=True)
         return batch, ppo.loss(config, state.policy, state.log_std, state.critic, batch)[0]

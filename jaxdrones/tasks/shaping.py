@@ -13,6 +13,7 @@ from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
+_PRECISE = 0.1  # m, over which the reward near the target falls by a factor of e
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
 _STEEP = 0.1  # length of the nose's level part below which there is no heading
@@ -45,6 +46,11 @@ def position(task: Task, world: World) -> Float[Array, " n"]:
     """Distance from the target, m; it levels off far away."""
     distance = length(world.drones.pos - task.target_now(world).pos, _NEAR)
     return distance / (1 + distance / _FAR)
+
+
+def near(task: Task, world: World) -> Float[Array, " n"]:
+    """exp(-distance / 10 cm) of the target; its slope is largest at the target."""
+    return jnp.exp(-length(world.drones.pos - task.target_now(world).pos, _NEAR) / _PRECISE)
 
 
 def velocity(task: Task, world: World) -> Float[Array, " n"]:

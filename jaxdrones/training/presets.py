@@ -128,7 +128,8 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ),
     # Rotors that lag filter the noise of actions; a policy trained with more noise oscillates less.
     ("hover", "ppo"): dict(
-        updates=750,
+        updates=1500,
+        hidden_sizes=(64, 64),
         critic_hidden_sizes=(64, 64),
         privileged_critic=True,
         target_kl=0.01,
@@ -163,6 +164,9 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
 _REALISTIC_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "hover": dict(delay=(0.0, 0.05)),  # s; in flight up to 40 ms, at which policies trained up to it oscillate
 }
+_REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
+    "hover": dict(precision=1.0),  # without it drones settle a few centimeters away, or too late
+}
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
 
 
@@ -194,7 +198,7 @@ def preset(
     if realistic and task in ("hover", "recovery", "landing"):
         options = (_ANY_VEHICLE if realistic == "any" else {"observation": _DELAYED_OBSERVATION}) | options
     if practice and isinstance(task, str):
-        options = _practice_options(task, realistic, options) | options
+        options = _practice_options(task, algorithm, realistic, options) | options
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
         settings = _CONFIGS.get((task, algorithm), {})
@@ -209,11 +213,12 @@ def preset(
     return env, config
 
 
-def _practice_options(task: str, realistic: bool | str, options: dict[str, Any]) -> dict[str, Any]:
+def _practice_options(task: str, algorithm: str, realistic: bool | str, options: dict[str, Any]) -> dict[str, Any]:
     """Options of the environment in training; with contact, physics steps are not longer than in flight."""
     practice = _PRACTICE_OPTIONS.get(task, {})
     if realistic is True:
         practice = practice | _REALISTIC_PRACTICE_OPTIONS.get(task, {})
+        practice = practice | (_REALISTIC_PPO_OPTIONS.get(task, {}) if algorithm == "ppo" else {})
     if not (options.get("obstacles") or options.get("contact")):
         return practice
     return {name: value for name, value in practice.items() if name != "substeps"}

@@ -119,6 +119,19 @@ def test_realistic_hover_trains_with_longer_delays_than_in_flight_unless_a_delay
     assert Recipe.of("hover", realistic="any").env(practice=True).delay == (0.0, 0.04)
 
 
+def test_only_ppo_for_realistic_hover_trains_with_the_reward_for_precision_and_none_flies_with_it():
+    trained = {
+        (algorithm, realistic): "near"
+        in Recipe.of("hover", algorithm, realistic=realistic).env(practice=True).task.rewards
+        for algorithm in ("ppo", "bptt")
+        for realistic in (False, True, "any")
+    }
+    assert [pair for pair, rewarded in trained.items() if rewarded] == [("ppo", True)]
+    assert "near" not in Recipe.of("hover", "ppo", realistic=True).env().task.rewards
+    given = Recipe.of("hover", "ppo", realistic=True, precision=0.5)
+    assert given.env(practice=True).task.rewards["near"][0] == given.env().task.rewards["near"][0] == 0.5
+
+
 def test_a_full_disk_is_reported_with_its_folder_before_training(tmp_path, monkeypatch):
     def full(self, content):
         raise OSError(errno.ENOSPC, "No space left on device")

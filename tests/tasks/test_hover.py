@@ -1,0 +1,23 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdrones as jd
+
+EAST = jnp.array([[1.0, 0.0, 0.0]])
+
+
+def test_the_reward_for_precision_falls_by_a_factor_of_e_in_ten_centimeters_and_is_steepest_near_the_goal():
+    env = jd.make("hover", precision=2.0)
+    _, world = env.reset(jax.random.key(0))
+    scale, near = env.task.rewards["near"]
+    goal = world.variables["goal"][0]
+
+    def reward(distance):
+        return scale * near(env.task, world.replace(drones=world.drones.replace(pos=goal[None] + distance * EAST)))[0]
+
+    assert float(reward(0.0)) == 2.0
+    far, farther = float(reward(0.5)), float(reward(0.6))
+    np.testing.assert_allclose(farther / far, np.exp(-1), rtol=1e-3)  # beyond the parabola within 2 cm
+    slopes = jax.vmap(jax.grad(reward))(jnp.array([0.03, 0.1, 0.3, 1.0]))
+    assert np.all(slopes < 0) and np.all(np.diff(np.asarray(slopes)) > 0)

@@ -35,7 +35,7 @@ def hover(
     tilt: Annotated[float, number("degrees", at_least=0, at_most=180)] = 90.0,
     height: Height = 2.0,
     duration: Seconds = 5.0,
-    precision: Annotated[float, number("", "weight of the reward near the goal", at_least=0)] = 0.0,
+    precision: Annotated[float, number(at_least=0, at_most=100)] = 0.0,
 ) -> Task:
     """Fly to the goal and hover there.
 
@@ -47,8 +47,8 @@ def hover(
         tilt: largest initial tilt, degrees.
         height: height of the goal, m; at most 1,000.
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
-        precision: weight of an additional reward exp(-distance / 10 cm) for training. Unlike the distance it is steep
-            near the goal, and PPO, whose actions are noisy, learns to stay within centimeters.
+        precision: weight of an additional reward exp(-distance / 10 cm) for training, at most 100. It is steep near the
+            goal, so that PPO, whose actions are noisy, learns to stay within centimeters.
     """
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:

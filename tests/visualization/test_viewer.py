@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from documents import ROOT
 from helpers import flying
+from live_viewer import same
 
 import jaxdrones as jd
 from jaxdrones.cli import main
@@ -58,13 +59,7 @@ def header(page):
 
 
 def test_positions_in_the_page_equal_the_record_to_a_tenth_of_a_millimetre(record):
-    world = header(show(record))["worlds"][0]
-    np.testing.assert_allclose(world["pos"], record.pos, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(world["targets"], record.target_pos, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(world["t"], record.t, rtol=1e-6)
-    for name in ("quat", "vel", "omega", "rpm"):  # half a step of 65,536 over what each column takes
-        half = np.ptp(getattr(record, name), axis=(0, 1)).max() / 65535 / 2
-        np.testing.assert_allclose(world[name], getattr(record, name), rtol=1e-6, atol=1.01 * half)
+    same(header(show(record))["worlds"][0], record)
 
 
 @pytest.mark.parametrize("extent", [1e-3, 1.0, 6.0, 7.0, 400.0])

@@ -5,13 +5,13 @@
 # barometer. Then it trains a policy for the task.
 
 # %%
-# Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
-# "jaxdrones[cli] @ git+https://..." with the address of a repository.
+# Installs the package where it is missing, from the checkout with this notebook. Elsewhere, as on Colab, set PACKAGE
+# to the path of a wheel, "jaxdrones-VERSION-py3-none-any.whl[cli]", or to "jaxdrones[cli] @ git+https://REPOSITORY".
 import importlib.util
 import subprocess
 import sys
 
-PACKAGE = "jaxdrones[cli]"
+PACKAGE = "..[cli]"
 if importlib.util.find_spec("jaxdrones") is None:
     subprocess.run([sys.executable, "-m", "pip", "install", "-q", PACKAGE], check=True)
 

@@ -125,7 +125,7 @@ def explain(env: Env) -> Explanation:
             "name": task.name,
             "summary": task.summary,
             "team": f"{env.drones} x {env.vehicle}",
-            "time": f"{task.duration:g} s at {1 / env.dt:g} control steps per second: {env.steps} control steps",
+            "time": f"{task.duration:.4g} s at {1 / env.dt:g} control steps per second: {env.steps} control steps",
             "start": description(task.start),
             "target": description(task.target),
             "success": description(task.success) if task.success else "no criterion",

@@ -36,6 +36,7 @@ def hover(
     height: Height = 2.0,
     duration: Seconds = 5.0,
     precision: Annotated[float, number(at_least=0, at_most=100)] = 0.0,
+    heading: Annotated[float, number(at_least=0, at_most=100)] = 0.0,
 ) -> Task:
     """Fly to the goal and hover there.
 
@@ -49,6 +50,7 @@ def hover(
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
         precision: weight of an additional reward exp(-distance / 10 cm) for training, at most 100. It is steep near the
             goal, so that PPO, whose actions are noisy, learns to stay within centimeters.
+        heading: weight of a penalty 1 - cos(heading), at most 100; without it a drone may turn away from its start.
     """
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
@@ -56,7 +58,8 @@ def hover(
         state = thrown(key, params, goal, reach=reach, speed=speed, omega=omega, tilt=jnp.radians(tilt))
         return state, {"goal": goal}
 
-    precise = {"near": (precision, shaping.near)} if precision else {}
+    added = {"near": (precision, shaping.near), "heading": (-heading, shaping.heading)}
+    chosen = {name: term for name, term in added.items() if term[0]}
     where = f"Within +-{reach:g} m of the goal, +-{speed:g} m/s, +-{omega:g} rad/s, tilted by up to {tilt:g} degrees."
     return Task(
         name="hover",
@@ -65,7 +68,7 @@ def hover(
         duration=duration,
         start=described(where, start),
         target=shaping.goal,
-        rewards=shaping.REACH_AND_STAY | precise,
+        rewards=shaping.REACH_AND_STAY | chosen,
         terminations=shaping.out_of_control(_MAX_REACH + SPACING * drones),
         success=settled if duration > SETTLED else None,
     )

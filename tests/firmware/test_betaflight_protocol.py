@@ -108,6 +108,20 @@ def test_the_throttle_gives_the_thrust_that_is_asked_for():
     assert sticks_for(racer, -1.0, np.zeros(3)).throttle == 0.05
 
 
+@pytest.mark.parametrize("vehicle", ["cf2x", "agilicious", "hb"])
+def test_a_yaw_rate_that_is_slow_by_1_rad_per_s_gives_15_rad_per_s2(vehicle):
+    """By Betaflight's formulas: 3.2029e-5 of a motor's range for each degree/s and unit of the gain."""
+    drone = load_params(vehicle)
+    share = settings.yaw_gain(drone) * 3.2029e-5 * np.rad2deg(1) * (1 - 0.055)
+    rpm = float(drone.hover_rpm) + share * float(drone.max_rpm) * np.sign(np.asarray(drone.rotor_spin))
+    torque = float(drone.km) * np.sum(np.asarray(drone.rotor_spin) * rpm**2)
+    np.testing.assert_allclose(torque / float(drone.inertia[2]), 15.0, rtol=0.06)  # the gain is a whole number
+
+
+def test_the_yaw_gain_is_at_most_the_largest_that_betaflight_takes():
+    assert settings.yaw_gain(load_params("racer")) == 250
+
+
 def test_a_request_of_msp_has_the_bytes_of_its_specification():
     assert msp.encode(204, b"\x01\x02") == b"$M<\x02\xcc\x01\x02" + bytes([0x02 ^ 0xCC ^ 0x01 ^ 0x02])
 

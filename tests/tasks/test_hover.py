@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
+from jaxdrones import rotation
 
 EAST = jnp.array([[1.0, 0.0, 0.0]])
 
@@ -21,3 +22,17 @@ def test_the_reward_for_precision_falls_by_a_factor_of_e_in_ten_centimeters_and_
     np.testing.assert_allclose(farther / far, np.exp(-1), rtol=1e-3)  # beyond the parabola within 2 cm
     slopes = jax.vmap(jax.grad(reward))(jnp.array([0.03, 0.1, 0.3, 1.0]))
     assert np.all(slopes < 0) and np.all(np.diff(np.asarray(slopes)) > 0)
+
+
+def test_the_penalty_of_the_heading_is_one_minus_its_cosine_and_absent_by_default():
+    env = jd.make("hover", heading=0.5)
+    _, world = env.reset(jax.random.key(0))
+    scale, heading = env.task.rewards["heading"]
+
+    def reward(yaw):
+        quat = rotation.from_rpy(jnp.array([0.0, 0.0, yaw]))[None]
+        return scale * heading(env.task, world.replace(drones=world.drones.replace(quat=quat)))[0]
+
+    yaw = jnp.radians(jnp.array([0.0, 30.0, -90.0, 180.0]))
+    np.testing.assert_allclose(jax.vmap(reward)(yaw), -0.5 * (1 - np.cos(yaw)), atol=5e-3)
+    assert "heading" not in jd.make("hover").task.rewards

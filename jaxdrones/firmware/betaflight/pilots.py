@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.control import Setpoint, rates
 from jaxdrones.firmware.betaflight.packets import Sticks
-from jaxdrones.firmware.betaflight.settings import MAX_RATE
+from jaxdrones.firmware.betaflight.settings import IDLE, MAX_RATE
 from jaxdrones.firmware.drone import Sample
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -20,14 +20,13 @@ Pilot = Callable[[float, Sample], Sticks]
 """(time since arming in s, sample) -> sticks, 100 times a second."""
 PERIOD = 0.01
 """Time between positions of the sticks, s."""
-_IDLE = 0.055  # output of a motor at no throttle; Betaflight's default
 _MIN_CHECK = 0.05  # stick up to which the throttle is zero
 
 
 def sticks_for(params: Params, thrust: float, omega: ArrayLike) -> Sticks:
     """Sticks for a total thrust (N) and body rates (3,) (rad/s, x forward, y left, z up) of a drone."""
     output = math.sqrt(max(thrust, 0.0) / (4 * float(params.kf))) / float(params.max_rpm)
-    share = min(max((output - _IDLE) / (1 - _IDLE), 0.0), 1.0)
+    share = min(max((output - IDLE) / (1 - IDLE), 0.0), 1.0)
     roll, pitch, yaw = np.rad2deg(np.asarray(omega, float)) / MAX_RATE
     return Sticks(float(roll), float(pitch), _MIN_CHECK + (1 - _MIN_CHECK) * share, float(-yaw))
 

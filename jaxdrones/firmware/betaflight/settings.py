@@ -1,12 +1,17 @@
-"""Settings and status of Betaflight by MSP: switches, rates, direction of the motors, arming."""
+"""Settings and status of Betaflight by MSP: switches, rates, gain of yaw, direction of the motors, arming."""
 
+import math
 import struct
 from typing import NamedTuple
 
+from jaxdrones.control import rates
 from jaxdrones.firmware.betaflight import msp
+from jaxdrones.params import Params
 
 MAX_RATE = 700
 """Rate at the end of a stick, degrees/s."""
+IDLE = 0.055
+"""Output of a motor at no throttle, a fraction of the largest; Betaflight's default."""
 _ARM, _ANGLE = 0, 1  # permanent numbers of modes
 _ACTUAL = 3  # kind of rates: center sensitivity and maximum, in 10 degrees/s
 _RATE_LIMIT = 1998  # degrees/s
@@ -16,6 +21,8 @@ _GYRO_HZ, _MOST_DENOMINATOR = 8000, 16  # rate of the gyroscope; largest quotien
 _FIRST_LOW_PASS, _LOW_PASS, _DYNAMIC = slice(0, 1), slice(20, 24), slice(29, 33)  # cutoffs for the gyroscope, Hz
 _LOOPS = 2  # for each state; with one, the states and Betaflight's clock, which has their pace, wait for each other
 _STICKS, _HOLD = 4, 1  # channels that keep their values if the receiver seems lost, for example as the clock jumped
+_YAW_P = 6  # place of its proportional gain
+_P_SCALE, _LARGEST_P = 3.2029e-5, 250  # share of a motor's range per degree/s and unit of the gain
 _SWITCH_ON = (1700, 2100)  # us
 _STATUS = struct.Struct("<HHHIBHBB")
 FLAGS = (
@@ -63,8 +70,8 @@ class Status(NamedTuple):
     """Reasons against arming, of `FLAGS`."""
 
 
-def configure(client: msp.Client, hz: float, reversed_yaw: bool = False) -> bool:
-    """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe and the direction of the motors.
+def configure(client: msp.Client, params: Params, hz: float, reversed_yaw: bool = False) -> bool:
+    """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe, yaw and the direction of the motors.
 
     The rate of the control loop becomes twice that of the states, and the low-pass filters of the gyroscope, which has
     no noise, are off: on a busy computer the loop runs less often, which makes filters and derivatives slower. All
@@ -72,6 +79,7 @@ def configure(client: msp.Client, hz: float, reversed_yaw: bool = False) -> bool
 
     Args:
         client: connection.
+        params: those of the drone, for the gain about its yaw axis.
         hz: states per second.
         reversed_yaw: whether the motors turn in the opposite of Betaflight's default direction.
 
@@ -83,8 +91,11 @@ def configure(client: msp.Client, hz: float, reversed_yaw: bool = False) -> bool
     """
     for slot, mode in enumerate((_ARM, _ANGLE)):
         client.request(msp.SET_MODE_RANGE, mode_range(slot, mode, slot))
-    rates = rc_tuning()
-    client.request(msp.SET_RC_TUNING, rates)
+    tuning = rc_tuning()
+    client.request(msp.SET_RC_TUNING, tuning)
+    gains = bytearray(client.request(msp.PID))
+    gains[_YAW_P] = yaw_gain(params)
+    client.request(msp.SET_PID, bytes(gains))
     client.request(msp.SET_MIXER, bytes([_QUAD_X, reversed_yaw]))
     failsafe = client.request(msp.FAILSAFE)  # whose clock jumps if this computer is busy
     client.request(msp.SET_FAILSAFE, bytes([_FAILSAFE_DELAY]) + failsafe[1:])
@@ -92,9 +103,19 @@ def configure(client: msp.Client, hz: float, reversed_yaw: bool = False) -> bool
         client.request(msp.SET_RX_FAIL, struct.pack("<BBH", channel, _HOLD, 1500))
     slower = _with_loop(client, hz)
     client.request(msp.EEPROM_WRITE)
-    if client.request(msp.RC_TUNING)[: len(rates)] != rates:
-        raise msp.NoAnswer("Betaflight did not take the rates; it is another version than 4.6")
+    if client.request(msp.RC_TUNING)[: len(tuning)] != tuning or client.request(msp.PID) != gains:
+        raise msp.NoAnswer("Betaflight did not take the rates and gains; it is another version than 4.6")
     return slower
+
+
+def yaw_gain(params: Params) -> int:
+    """Proportional gain about the yaw axis, with which a hovering drone follows as fast as by the controller `rates`.
+
+    Betaflight's default, 45, suits propellers of larger torque; with those of the racer, the integral term oscillates.
+    """
+    per_output = 8 * float(params.km * params.hover_rpm * params.max_rpm / params.inertia[2]) * (1 - IDLE)  # rad/s^2
+    wanted = float(rates.gains().rate[2]) / (_P_SCALE * math.degrees(1) * per_output)
+    return min(max(round(wanted), 1), _LARGEST_P)
 
 
 def _with_loop(client: msp.Client, hz: float) -> bool:

@@ -118,8 +118,8 @@ def test_a_yaw_rate_that_is_slow_by_1_rad_per_s_gives_15_rad_per_s2(vehicle):
     np.testing.assert_allclose(torque / float(drone.inertia[2]), 15.0, rtol=0.06)  # the gain is a whole number
 
 
-def test_the_yaw_gain_is_at_most_the_largest_that_betaflight_takes():
-    assert settings.yaw_gain(load_params("racer")) == 250
+def test_the_yaw_gain_of_propellers_with_little_torque_is_limited():
+    assert settings.yaw_gain(load_params("racer")) == 100
 
 
 def test_a_request_of_msp_has_the_bytes_of_its_specification():

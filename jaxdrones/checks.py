@@ -216,12 +216,7 @@ def check_arrays(**trees: Any) -> None:
 
 
 def check_params(params: Any, finite: bool = True) -> None:
-    """Raise for concrete constants of a drone or a team that cannot fly.
-
-    Args:
-        params: of a drone or a team.
-        finite: whether to check all of them, not only those that must be positive.
-    """
+    """Raise for concrete constants of a drone or a team that cannot fly; without `finite` only if not positive."""
     constants = vars(params)
     check_arrays(params=params)
     if finite:

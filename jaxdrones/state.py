@@ -35,11 +35,7 @@ class State(PyTreeNode):
     @classmethod
     @checked
     def at_rest(cls, pos: Annotated[ArrayLike, _ROWS], yaw: ArrayLike | None = None) -> State:
-        """Level team at rest with stopped rotors.
-
-        Args:
-            pos: (n, 3) positions, m, world.
-            yaw: (n,) headings, rad; by default zero.
+        """Level team at rest with stopped rotors; positions (n, 3), m, world, and headings (n,), rad, zero by default.
 
         Raises:
             ValueError: a wrong shape, no drone, or a number that is not finite.

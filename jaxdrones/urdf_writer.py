@@ -13,14 +13,9 @@ _INVALID = re.compile(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD\U00010000-\U0010FFFF]")
 
 
 def to_urdf(params: Params, name: str, comment: str = "") -> str:
-    """Text of a URDF of one drone, for `load_params`.
+    """Text of a URDF of one drone with a finite highest rotor speed, for `load_params`.
 
-    Gravity, air, wind, forces and constants in `aux` are not written.
-
-    Args:
-        params: of one drone, with a finite highest rotor speed.
-        name: of the robot.
-        comment: comment at the top, made valid for XML.
+    The comment at the top is made valid for XML. Gravity, air, wind, forces and constants in `aux` are not written.
     """
     comment, name = re.sub("-(?=-)", "- ", _INVALID.sub("", comment)), _INVALID.sub("", name)
     thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)

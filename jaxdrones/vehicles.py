@@ -75,15 +75,10 @@ Vary = Callable[..., Array]
 
 
 def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """Random quadrotor; gravity, air, wind, external force and `aux` are those of `params`.
+    """Random quadrotor; gravity, air, wind, external force and `aux` are those of `params`, of one drone.
 
-    The ground effect is that of Cheeseman and Bennett; the downwash of equation 6 is off.
-
-    Args:
-        key: random key.
-        params: parameters of one drone.
-        lightest: smallest mass, kg.
-        heaviest: largest mass, kg.
+    The ground effect is that of Cheeseman and Bennett; the downwash of equation 6 is off. `lightest` and `heaviest` are
+    the smallest and the largest mass, kg.
 
     Raises:
         ValueError: masses outside 20 g to 3 kg, or the lightest is not first.

@@ -124,21 +124,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         render_mode: pictures.RenderMode = None,
         **options: Any,
     ):
-        """Wrap an environment.
+        """Wrap an environment; arguments that are not described here are those of `GymnasiumEnv`.
 
-        Args:
-            task: a name, a task, or an environment.
-            num_envs: number of worlds.
-            dict_spaces: as for `GymnasiumEnv`.
-            team_reward: as for `GymnasiumEnv`.
-            numpy: whether to return new NumPy arrays; else JAX arrays, without copies and asynchronous, with
-                `final_obs` and `final_info` in every step.
-            max_episode_steps: time limit in steps, in place of the task's duration.
-            autoreset_mode: a mode of gymnasium or its value: `SAME_STEP`, reset in the step that ends an episode;
-                `NEXT_STEP`, in the step after it, with its action ignored and zero reward; `DISABLED`, only by
-                `reset(options={"reset_mask": ...})`.
-            render_mode: `rgb_array` or `None`.
-            **options: options of `jaxdrones.make`.
+        With `numpy` results are new NumPy arrays; else JAX arrays, without copies and asynchronous, with `final_obs`
+        and `final_info` in every step. `max_episode_steps` is a time limit in steps, in place of the task's duration.
+        The autoreset mode is one of gymnasium or its value: `SAME_STEP`, reset in the step that ends an episode;
+        `NEXT_STEP`, in the step after it, with its action ignored and zero reward; `DISABLED`, only by
+        `reset(options={"reset_mask": ...})`.
         """
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:

@@ -114,8 +114,7 @@ def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
 def rewarding(team_reward: Annotated[str, choice("team_reward", ("sum", "mean"))]) -> Callable[[Any], Any]:
     """Function from the rewards (*batch, n) of the drones to that (*batch) of their team.
 
-    Args:
-        team_reward: `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or `mean`, independent of the team's size.
+    It is the `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or the `mean`, independent of the team's size.
     """
     return lambda rewards: getattr(rewards, team_reward)(-1)
 

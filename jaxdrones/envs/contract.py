@@ -17,15 +17,11 @@ class ContractError(AssertionError):
 
 
 def check_env(env: Env, steps: int = 5) -> None:
-    """Test an environment with a few steps of random actions.
+    """Test an environment with a few control steps of random actions.
 
     It checks shapes, types and bounds; that the same key gives the same episode; that arguments are not mutated; that
     the reward is the sum of its named terms; that invalid actions are rejected; and on the explicit backend also that
     `jax.jit` and `jax.vmap` give the same results as plain calls.
-
-    Args:
-        env: the environment.
-        steps: number of control steps.
 
     Raises:
         ContractError: the contract is violated.

@@ -173,12 +173,7 @@ class Env:
         return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
     def reset(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Obs, World]:
-        """First observation and world of an episode.
-
-        Args:
-            key: random key.
-            progress: progress of training in [0, 1], for a task with a curriculum.
-        """
+        """First observation and world; `progress` is that of training in [0, 1], for a task with a curriculum."""
         obs, world = self.begin(key, progress)
         if self.vision:
             world = self.with_images("first", key, world)

@@ -106,9 +106,6 @@ class Explanation:
 def explain(env: Env) -> Explanation:
     """Describe the observation, action, rewards and simulation of an environment.
 
-    Args:
-        env: environment of `jaxdrones.make`.
-
     Returns:
         An object with a table as its text (`print(jaxdrones.explain(env))`), and with `as_dict()` for JSON.
 

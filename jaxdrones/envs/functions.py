@@ -67,17 +67,8 @@ def check_episode(
 ) -> list[int]:
     """Validate the results of users' functions by tracing them; those of starts and randomizations for some keys.
 
-    Args:
-        task: the task.
-        params: nominal parameters of the team.
-        draws: randomizations of the parameters.
-        scene: scene of all episodes, or a function for random scenes.
-        terms: observation terms.
-        dt: control period, s.
-        first_world: (key) -> world at the start of an episode, with the first readings of the sensors.
-
-    Returns:
-        Length of each observation term of a drone.
+    The arguments are those of the environment; `first_world` is `(key) -> world` at the start of an episode, with the
+    first readings of the sensors. Return the length of each observation term of a drone.
 
     Raises:
         UserError: an invalid result; the message names the function and its file.

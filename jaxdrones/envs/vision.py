@@ -133,14 +133,9 @@ def make_vision(
     dt: float,
     scene: Scene | DrawScene,
 ) -> Vision:
-    """Build the vision of an environment.
+    """Build the vision of an environment with a control period of `dt` s: images of the camera on every drone.
 
-    Args:
-        step: of either backend; a Bullet step renders the images itself.
-        images: any of `rgb`, `depth`, `segmentation`.
-        camera: on every drone.
-        dt: control period, s.
-        scene: of the environment; a Bullet step was built with it unless it is random.
+    A Bullet step renders the images itself, and was built with the scene unless that is random.
     """
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:

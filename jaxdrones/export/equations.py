@@ -43,16 +43,13 @@ _CODES = {getattr(casadi, f"OP_{name}"): text for name, text in _OPERATIONS.item
 
 
 def javascript(name: str, function: Callable, **arguments: Any) -> str:
-    """Text of a JavaScript function of arrays of numbers.
+    """Text of a JavaScript function of arrays of numbers for a traceable function of pytrees of arrays.
 
-    Args:
-        name: of the function.
-        function: a traceable function of pytrees of arrays that returns a pytree.
-        arguments: examples of the arguments of `function` in order, by name; only their shapes are used.
+    Of the `arguments`, examples in order and by name, only the shapes are used.
 
     Returns:
-        `function name(out, ...)`: writes the entries of the result into the array `out`, leaf after leaf. Each of the
-        arguments is the array of the entries of a pytree, in the same order.
+        `function name(out, ...)`: writes the entries of the result into the array `out`, leaf after leaf. Each of
+        the arguments is the array of the entries of a pytree, in the same order.
 
     Raises:
         NotImplementedError: an operation without a counterpart.

@@ -87,12 +87,9 @@ class _Layers:
 
 
 def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
-    """Layers of a policy whose drones share one network.
+    """Layers of a policy with a network of this library that all drones share.
 
-    Args:
-        policy: policy with a network of this library.
-        images: images that it observes, in the order of their names: `depth` (height, width) and `rgb`
-            (height, width, 4).
+    It observes the images, in the order of their names: `depth` (height, width) and `rgb` (height, width, 4).
     """
     assert not policy.per_agent, "give the policy of one drone"
     network = policy.network

@@ -75,15 +75,10 @@ class Simulation:
 
 @checked
 def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of drones")] = 1) -> Simulation:
-    """Simulation of the nominal vehicle of an environment, flown by a policy or by controllers.
+    """Simulation of the nominal vehicle of an environment, flown to a target, to stay, by a policy or by controllers.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
-    external force (N, world).
-
-    Args:
-        policy: policy that flies one drone to a target and stays.
-        env: its environment.
-        drones: number of drones, which fly without influence on each other, each at its own goal.
+    external force (N, world). The drones fly without influence on each other, each at its own goal.
 
     Raises:
         ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.

@@ -15,16 +15,12 @@ PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 
 def program(policy: Policy, images: tuple[Tensor, ...]) -> bytes:
-    """Serialized program of a policy whose drones share one network, in float32.
-
-    Args:
-        policy: policy with any network.
-        images: images that it observes, in the order of their names.
+    """Serialized program of a policy, with any network that all drones share, in float32.
 
     Returns:
-        Bytes for `jax.export.deserialize`. The program maps `obs` (batch, d), the images (batch, height, width, ...) in
-        the order of their names, and for a recurrent policy its hidden state, to the actions (batch, a), or to
-        actions and next hidden state.
+        Bytes for `jax.export.deserialize`. The program maps `obs` (batch, d), the images (batch, height, width,
+        ...) in the order of their names, and for a recurrent policy its hidden state, to the actions (batch, a), or
+        to actions and next hidden state.
 
     Raises:
         ValueError: flatbuffers is not installed.

@@ -128,17 +128,11 @@ def motor_start_row(log: FlightLog) -> int:
 def simulate_closed_loop(
     log: FlightLog, vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains
 ) -> ClosedLoopResult:
-    """Simulate a vehicle in closed loop on the set-points of a log.
+    """Simulate a vehicle in closed loop on the set-points of a log, which also has PWM and battery voltage.
 
     The firmware's PID starts on the ground, with empty integrators, when the motors of the log start. Until the landing
     its only inputs are the logged set-points and battery voltage. For a log that begins in flight, the simulation
     starts in that state, with the vertical integrator at its value in hover. The result has the rows after the climb.
-
-    Args:
-        log: flight with set-points, PWM and battery voltage.
-        vehicle: the vehicle to simulate.
-        motors: motors of the vehicle.
-        gains: gains of the firmware.
     """
     rows, begin = rows_after_climb(log), motor_start_row(log)
     ref_pos, _, recorded_pwm, _ = closed_loop_columns(log)

@@ -71,13 +71,10 @@ def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
 
 
 def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"], motors: Motors | None) -> State:
-    """Predicted states of one drone at the horizons, in terms of its log.
+    """Predicted states of one drone at the horizons, in terms of its log, from a logged state.
 
-    Args:
-        vehicle: parameters of the drone and of its instruments.
-        start: logged state at the start.
-        command: recorded inputs of one window, see `Windows.command`.
-        motors: map from duty cycle to thrust, followed with the vehicle's rotor lag; `None` for measured rotor speeds.
+    The command are the recorded inputs of one window, see `Windows.command`. The motors map a duty cycle to thrust,
+    which is followed with the vehicle's rotor lag; `None` for measured rotor speeds.
     """
     params, instruments = vehicle.params, vehicle.instruments
     speed, rate = _rotor_speed(vehicle, command, motors)

@@ -24,15 +24,13 @@ _MIN_PEAK_PWM = 0.1 * _FULL_PWM  # no quadrotor flies below a tenth of the duty 
 
 
 def load_flights(*files: str | os.PathLike, allow_inconsistent: bool = False) -> list[FlightLog]:
-    """Read logs for identification: one for each drone, resampled to 100 Hz, with unique names.
+    """Read logs for identification (see `read_log`): one for each drone, resampled to 100 Hz, with unique names.
 
-    Args:
-        files: see `read_log`.
-        allow_inconsistent: whether to accept logs with contradictory columns, see `inconsistencies`.
+    With `allow_inconsistent` the columns of a log may contradict each other, see `inconsistencies`.
 
     Raises:
-        UserError: a log that cannot be read, without inputs, with implausible units, too low a rate, or contradictory
-            columns.
+        UserError: a log that cannot be read, without inputs, with implausible units, too low a rate, or
+            contradictory columns.
     """
     return named_apart([drone for file in files for drone in prepare(read_log(file), allow_inconsistent)])
 

@@ -40,16 +40,11 @@ class Batch(PyTreeNode):
 def batch_of(
     config: Any, state: Any, hidden_state: Any, trajectory: collect.Trajectory, noise: Array, ends_alone: bool = False
 ) -> Batch:
-    """Transitions of a trajectory with normalized advantages and value targets.
+    """Transitions of a trajectory with normalized advantages and value targets, for the `state` before the update.
 
-    Args:
-        config: settings.
-        state: state before the update.
-        hidden_state: (w, n, ...) hidden state of the policy before the trajectory, or `None`.
-        trajectory: trajectory.
-        noise: (k, w, n, a) standard normal noise of the actions of a centralized critic after the end of the trajectory
-            and of truncated episodes; at most k - 1 episodes of a world are truncated.
-        ends_alone: whether a drone's episode may end before that of its team.
+    The hidden state (w, n, ...) is that before the trajectory, or `None`. The `noise` (k, w, n, a) is standard normal,
+    of the actions of a centralized critic after the end of the trajectory and of truncated episodes; at most k - 1
+    episodes of a world are truncated. With `ends_alone` a drone's episode may end before that of its team.
     """
     policy, action = state.policy, trajectory.action if config.centralized_critic else None
     critic_obs = critic_observation(policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged, action)

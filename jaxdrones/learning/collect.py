@@ -121,19 +121,15 @@ def collect(
 ) -> tuple[Worlds, Trajectory]:
     """Simulate all worlds for `length` control steps; with `jax.set_mesh` each device simulates its share.
 
-    Args:
-        key: random key.
-        env: environment.
-        act: function of the actions in all worlds. On several devices it is differentiated only with respect to the
-            arguments of a `jax.tree_util.Partial`.
-        worlds: worlds at the start of the trajectory.
-        length: control steps.
-        noise: (length, w, ...) first argument of `act` in every step.
-        starts: starts of further episodes. A world whose episode ends continues from the start of another world, of a
-            different one in every step, so that hard starts do not repeat themselves. By default the drones are frozen
-            after the end of an episode, and all later steps are marked by `was_done`, until `restart` starts a new one.
-        between_steps: function of the worlds between steps, to change their gradient.
-        privileged: whether to record privileged observations.
+    On several devices `act`, the actions in all worlds, is differentiated only with respect to the arguments of a
+    `jax.tree_util.Partial`. Its first argument in every step is a row of `noise` (length, w, ...).
+
+    With `starts` of further episodes, a world whose episode ends continues from the start of another world, of a
+    different one in every step, so that hard starts do not repeat themselves. By default the drones are frozen after
+    the end of an episode, and all later steps are marked by `was_done`, until `restart` starts a new one.
+
+    `between_steps` is a function of the worlds between steps, to change their gradient; `privileged` records privileged
+    observations.
     """
 
     def one_step(key: jax.Array, episode: Episode, action: Array) -> tuple:

@@ -59,14 +59,10 @@ class Report(PyTreeNode):
 
 @checked
 def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: Count = 1000) -> Report:
-    """Simulate whole episodes; steps after the end of an episode are ignored.
+    """Simulate whole episodes on either backend; steps after the end of an episode are ignored.
 
-    Args:
-        env: environment of either backend.
-        policy: function from observations, (n, d) or a dictionary with images, to actions (n, a); a pytree that is
-            called like one; or a recurrent policy, see `learning.networks`.
-        key: random key.
-        episodes: number of episodes.
+    The policy is a function from observations, (n, d) or a dictionary with images, to actions (n, a); a pytree that is
+    called like one; or a recurrent policy, see `learning.networks`.
 
     Raises:
         ValueError: no random key, or more episodes than fit in memory.

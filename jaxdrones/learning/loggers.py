@@ -39,11 +39,7 @@ class CSV:
 
 
 class TensorBoard:
-    """Log scalars to TensorBoard, by tensorboardX.
-
-    Args:
-        folder: folder of the event file.
-    """
+    """Log scalars to an event file of TensorBoard in a folder, by tensorboardX."""
 
     def __init__(self, folder: str | os.PathLike):
         self._writer = _library("tensorboardX").SummaryWriter(str(folder))

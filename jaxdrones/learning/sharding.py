@@ -62,16 +62,12 @@ def shard_state(mesh: Mesh, state: Any) -> Any:
 
 
 def map_worlds(function: Callable, in_specs: Any, out_specs: Any) -> Callable:
-    """Map a function over the devices of `jax.set_mesh`, each with its own worlds.
+    """Map a function of arrays over the devices of `jax.set_mesh`, each with its own worlds.
 
-    The gradient with respect to a `REPLICATED` argument is summed over the devices, as needed for a loss over all
-    worlds outside of the function. With `check_vma=False` this sum is formed once, at the end, and not in every step of
-    a scan.
-
-    Args:
-        function: function of arrays; values in its closure must not be differentiated.
-        in_specs: `WORLDS`, `STEPS` or `REPLICATED` for each argument.
-        out_specs: the same for each result.
+    The specifications of arguments and results are `WORLDS`, `STEPS` or `REPLICATED`. Values in the closure of the
+    function must not be differentiated. The gradient with respect to a `REPLICATED` argument is summed over the
+    devices, as needed for a loss over all worlds outside of the function. With `check_vma=False` this sum is formed
+    once, at the end, and not in every step of a scan.
     """
     if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:
         return function

@@ -29,11 +29,7 @@ _UNCHANGED = frozenset(  # primitives that leave values unchanged
 
 
 def on_symbols(function: Callable, **arguments: Any) -> tuple[list, Any]:
-    """Evaluate a traceable function on symbols.
-
-    Args:
-        function: of pytrees of arrays.
-        arguments: pytrees with the shapes of the arguments, by name of the symbols and in order.
+    """Evaluate a traceable function of pytrees of arrays on symbols, named like the arguments and with their shapes.
 
     Returns:
         One vector of symbols per argument, `casadi.SX`, and the vector of the results.

@@ -54,12 +54,9 @@ class Backend:
     """Backend with Crazyswarm2's interface."""
 
     def __init__(self, node: Any, names: list[str], states: Sequence[SwarmState]):
-        """Start a team.
+        """Start a team of drones with these names and initial states; `step` updates the same states and returns them.
 
-        Args:
-            node: server, a node of rclpy; its parameters configure the backend, and it publishes the clock.
-            names: of the drones.
-            states: initial states of the drones; the same objects are updated and returned by `step`.
+        The parameters of the server, a node of rclpy, configure the backend, which publishes the clock by it.
         """
         self.names, self._states, self._steps = names, list(states), 0
         self.dt = float(_parameter(node, "dt", 0.0005))

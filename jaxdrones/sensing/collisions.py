@@ -43,16 +43,10 @@ def collisions(
     scene: AnalyticScene = _BARE,
     margin: Annotated[ArrayLike, number("m", at_least=0)] = _MARGIN,
 ) -> Collisions:
-    """Compute which drones of a team touch the ground, another drone or an obstacle.
+    """Compute which drones of a team touch the ground, another drone or an obstacle; velocities do not matter.
 
     A drone is its collision cylinder. The contact `balls` of both backends lie inside it; they reach its faces and rim,
-    not its edges.
-
-    Args:
-        params: of a team of n drones.
-        state: of the team; only its poses matter.
-        scene: of the world.
-        margin: largest gap that counts as contact, m.
+    not its edges. `margin` is the largest gap that counts as contact, m.
 
     Raises:
         ValueError: a wrong shape, a mesh or URDF file in the scene, or a negative margin.

@@ -156,12 +156,9 @@ class Scene(PyTreeNode, kw_only=True):
 
     @checked
     def padded(self, **capacity: Annotated[int, whole("capacity of {argument}")]) -> Scene:
-        """Pad the arrays of a scene to given lengths with inactive obstacles.
+        """Pad the arrays of a scene with inactive obstacles to lengths by name, for example `boxes=8, cylinders=30`.
 
         Worlds with different numbers of obstacles then have one structure, and can be stacked and mapped.
-
-        Args:
-            capacity: length of the arrays by name, for example `boxes=8, cylinders=30`.
 
         Raises:
             ValueError: an unknown kind, or more obstacles than the array holds.

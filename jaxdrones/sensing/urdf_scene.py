@@ -34,14 +34,9 @@ def from_urdf(
 ) -> Scene:
     """Load the boxes, spheres, cylinders and capsules of a URDF as static obstacles.
 
-    They are its `collision` elements, in the color of the link's first `visual`. Joints are at zero. A mesh becomes a
-    `Mesh`, for Bullet alone; `Mesh.bounding_box` makes a box of it.
-
-    Args:
-        path: of the URDF.
-        pos: (3,) of its root link, m, world.
-        quat: (4,) attitude of its root link, unit quaternion (x, y, z, w).
-        ground: whether there is a ground plane at z = 0, too.
+    They are its `collision` elements, in the color of the link's first `visual`. Joints are at zero, and the root link
+    is at `pos` (3,), m, with the attitude `quat` (4,), a unit quaternion (x, y, z, w), world. A mesh becomes a `Mesh`,
+    for Bullet alone; `Mesh.bounding_box` makes a box of it. `ground` adds a plane at z = 0.
 
     Raises:
         ValueError: a missing file, a file that is not a URDF, or an unsupported shape or number.

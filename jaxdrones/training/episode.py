@@ -89,15 +89,10 @@ def fly_episode(
     on_progress: Callable[[float], Any] = lambda fraction: None,
     watch: Callable[[EpisodeLog, float], Any] | None = None,
 ) -> EpisodeLog:
-    """Fly one episode with a policy.
+    """Fly one episode with a policy, as of `evaluate`, on either backend.
 
-    Args:
-        env: environment of either backend.
-        policy: observations (n, d), or a dictionary with images, -> actions (n, a); or a recurrent policy, see
-            `learning.networks`.
-        key: random key of the start and of the noise.
-        on_progress: function of the completed fraction of the longest possible episode; called on Bullet only.
-        watch: function `(leg, end)`, called with each 1/30 s of the episode and the latest possible end time, s.
+    `on_progress` is called with the completed fraction of the longest possible episode, on Bullet only; `watch(leg,
+    end)` with each 1/30 s of the episode and the latest possible end time, s.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)

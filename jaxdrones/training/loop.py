@@ -53,19 +53,14 @@ def train(
 ) -> None:
     """Train one seed to the end, from the start or from the state of the run; evaluate the best policy.
 
-    Args:
-        trainer: compiled programs.
-        run: run with a prepared folder.
-        seed: seed of all random numbers.
-        on_progress: function that displays progress.
-        deadline: end of the training, s on the clock of `time.perf_counter`; the number of updates then follows from
-            the measured durations of updates and evaluations, and is at least one more.
-        loggers: called with the metrics of every update, such as those of `learning.loggers`.
-        keep_history: whether to keep the policies of all evaluations; a run that has kept some goes on.
+    The folder of the run is prepared. The deadline is the end of the training, s on the clock of `time.perf_counter`;
+    the number of updates then follows from the measured durations of updates and evaluations, and is at least one more.
+    Loggers are called with the metrics of every update. With `keep_history` the policies of all evaluations are kept; a
+    run that has kept some goes on.
 
     Raises:
-        Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
-            kept.
+        Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so
+            far is kept.
         KeyboardInterrupt: re-raised after saving the state, unless there are other hosts.
     """
     recipe = trainer.recipe

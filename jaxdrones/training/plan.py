@@ -99,17 +99,12 @@ def score_of(success: float | None, mean_return: float) -> Score:
 
 
 def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0) -> int:
-    """Index of the policy to keep.
+    """Index of the policy to keep, of evaluations with the same number of episodes.
 
     It is the first one with the highest return among policies whose success rate is statistically tied for first. Two
     success rates are tied if their Wilson intervals of one standard error overlap: for 1,000 episodes, a difference of
-    1 is a tie, and a difference of 5 is not.
-
-    Args:
-        scores: scores of all policies to choose from.
-        episodes: number of episodes of each evaluation.
-        highest_success: highest success rate of earlier evaluations, with as many episodes. It keeps small losses from
-            accumulating over selections.
+    1 is a tie, and a difference of 5 is not. `highest_success` is the highest success rate of earlier evaluations; it
+    keeps small losses from accumulating over selections.
     """
 
     def interval(success: float) -> tuple[float, float]:

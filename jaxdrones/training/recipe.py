@@ -47,13 +47,9 @@ class Recipe:
         realistic: bool | str = False,
         **changes: Any,
     ) -> Recipe:
-        """Preset with changes.
+        """Preset of a task, by name or `file.py:function`, with changes.
 
-        Args:
-            task: a name of `jaxdrones.envs.TASKS`, or `file.py:function` of a function that returns a task.
-            algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
-            realistic: see `presets.preset`.
-            **changes: settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
+        These are settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
         """
         task, files = user_files.take_task(task)
         function = user_files.task_of(task, files)

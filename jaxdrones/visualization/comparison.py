@@ -21,13 +21,8 @@ def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str, af
     """Draw flights of the same example: a color for each flight, with commands dashed.
 
     Beside the paths are the errors of each flight over time, mean and range over its drones, and for two flights with
-    the same times the distance between them, largest over the drones.
-
-    Args:
-        records: logs by name.
-        path: path of the picture; its suffix chooses the format.
-        title: title of the figure.
-        after: start of the panels over time, s, as in `jaxdrones.flights.results.results`.
+    the same times the distance between them, largest over the drones. `after` is the start of these panels, s, as in
+    `jaxdrones.flights.results.results`.
     """
     tints = colors(len(records))
     flights = list(records.values())

@@ -46,21 +46,11 @@ def film(
     size: tuple[int, int] = SIZE,
     on_frame: Callable[[float], Any] = lambda share: None,
 ) -> int:
-    """Write a film of a flight with colored drones, trails, targets and a clock.
+    """Write a film of a flight with colored drones, trails, targets and a clock; return its number of frames.
 
-    Bullet draws all drones alike, without trails, targets or clock.
-
-    Args:
-        record: log of the flight.
-        path: path of the film, .mp4 or .gif.
-        title: title above.
-        renderer: one of `RENDERERS`; by default that of `choose_renderer`.
-        fps: frames per simulated second.
-        size: width and height, pixels; even numbers.
-        on_frame: function of the completed fraction, called after every frame.
-
-    Returns:
-        The number of frames.
+    Bullet draws all drones alike, without trails, targets or clock. The default renderer is that of `choose_renderer`;
+    `fps` counts frames per simulated second, `size` is width and height in pixels, both even, and `on_frame` is called
+    with the completed fraction after every frame.
 
     Raises:
         ValueError: a missing dependency, or no finite state in the flight.

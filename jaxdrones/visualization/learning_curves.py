@@ -38,15 +38,9 @@ def save_curves(
 ) -> None:
     """Draw learning curves over the number of control steps.
 
-    Each run is a line. Several runs also have their median, and a band from lowest to highest. The success rate of a
-    single run has error bars of its confidence intervals. A star marks the evaluation of the best policy of each run.
-
-    Args:
-        histories: label -> rows of progress.csv, from `training.run.Run.history`.
-        path: path of the picture.
-        title: title of the figure.
-        interval: function for the 95 % interval of a success rate; by default none is drawn.
-        kept: label -> update of the best policy.
+    Each run of `histories`, label -> rows of progress.csv, is a line. Several runs also have their median, and a band
+    from lowest to highest. The success rate of a single run has error bars of its confidence intervals, by the function
+    `interval`. A star marks the evaluation of the best policy of each run, by its update in `kept`.
     """
     from matplotlib.ticker import EngFormatter
 
@@ -89,10 +83,7 @@ def save_curves(
 
 
 def spread(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Median, lowest and highest of several curves over their common range.
-
-    Args:
-        curves: (p, 2) points of each, number of steps and value, with linear interpolation.
+    """Median, lowest and highest of several curves (p, 2), number of steps and value, over their common range.
 
     Returns:
         Numbers of steps, medians, lowest and highest values, each (s,); empty without overlap.

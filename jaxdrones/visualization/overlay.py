@@ -61,15 +61,7 @@ class Overlay:
             self._title += f" (drones {scale:g} times as large as they are)"
 
     def draw(self, picture: np.ndarray, depth: np.ndarray, lens: Lens, row: int, time: float) -> np.ndarray:
-        """Draw the overlay on a picture (h, w, 3) uint8.
-
-        Args:
-            picture: (h, w, 3) uint8.
-            depth: (h, w) depth of the picture, m.
-            lens: of the picture.
-            row: of the record.
-            time: s, for the clock.
-        """
+        """Draw the overlay on a picture (h, w, 3) uint8 with depths (h, w), m, of a row of the record and a time, s."""
         width, height = lens.size
         fine = Image.new("RGBA", (2 * width, 2 * height))
         brush = ImageDraw.Draw(fine)

@@ -43,11 +43,7 @@ SUFFIXES = (".png", ".pdf")
 
 
 def check_matplotlib() -> None:
-    """Raise `ValueError` where matplotlib cannot be used.
-
-    Raises:
-        ValueError: matplotlib is not installed, or its settings are invalid.
-    """
+    """Raise `ValueError` where matplotlib is not installed, or its settings are invalid."""
     try:
         import matplotlib  # noqa: F401
     except ValueError as error:  # in MPLBACKEND or in its file of settings
@@ -61,11 +57,7 @@ def check_matplotlib() -> None:
 def save_flight(record: FlightLog, path: Path, title: str, panels: Sequence[str] = ()) -> None:
     """Draw paths and signals of a flight over time, with one color per drone and commands dashed.
 
-    Args:
-        record: log of the flight.
-        path: path of the picture; its suffix chooses the format.
-        title: title of the figure.
-        panels: names of `PANELS`, or `error`; empty for all `PANELS`.
+    The panels are names of `PANELS`, or `error`; by default all `PANELS`.
     """
     panels = panels or list(PANELS)
     columns = 1 if len(panels) < 4 else 2

@@ -16,12 +16,7 @@ _HALF = 0.54  # of the extent of a path: half of the width and height of its pan
 
 
 def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
-    """Draw the open-loop errors of flights over the horizon.
-
-    Args:
-        errors: open-loop errors (horizons, 4) by flight.
-        path: path of the picture.
-    """
+    """Draw the open-loop errors of flights, (horizons, 4) each, over the horizon."""
     t = np.array(HORIZONS) * PERIOD
     with style.figure(16, 5) as figure:
         axes = figure.subplots(1, len(QUANTITIES))
@@ -34,12 +29,7 @@ def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
 
 
 def save_paths(simulated: Mapping[str, Sequence[ClosedLoopResult]], path: Path) -> None:
-    """Draw the recorded and simulated horizontal paths of flights and their set-points.
-
-    Args:
-        simulated: closed-loop simulations of the same flights by each vehicle.
-        path: path of the picture.
-    """
+    """Draw recorded and, by vehicle, simulated horizontal paths of flights, and their set-points."""
     flights = list(zip(*simulated.values(), strict=True))
     rows = -(-len(flights) // _COLUMNS)
     columns = -(-len(flights) // rows)

@@ -48,12 +48,7 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
 
     The camera is static if the whole flight fits with large enough drones. Otherwise it follows the bounding box of the
     team. Its direction is that with the fewest obstructed sight lines; an obstacle that still obstructs a fifth of
-    them, such as a ceiling, is left out.
-
-    Args:
-        record: log of the flight.
-        fps: frames per second.
-        aspect: width of the picture over its height.
+    them, such as a ceiling, is left out. `aspect` is the width of the picture over its height.
 
     Raises:
         ValueError: no finite state in the flight.

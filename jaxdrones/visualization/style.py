@@ -63,14 +63,10 @@ def save(figure: Any, path: str | os.PathLike) -> None:
 
 
 def limits(lines: np.ndarray, smallest: float = 0.0) -> tuple[float, float]:
-    """Limits of an axis, robust to short spikes.
+    """Limits of an axis for lines (K, n), one a column, robust to short spikes; values that are not finite are ignored.
 
     They contain all samples, unless that is more than three times the range of the middle 95 % of each line. Then they
-    contain those samples and half as much to both sides.
-
-    Args:
-        lines: (K, n) one column per line; values that are not finite are ignored.
-        smallest: smallest range, against magnified noise.
+    contain those samples and half as much to both sides. They are at least `smallest` apart, against magnified noise.
     """
     lines = np.where(np.isfinite(lines), lines, np.nan)
     lines = lines[:, ~np.isnan(lines).all(axis=0)]

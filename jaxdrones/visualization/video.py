@@ -14,11 +14,7 @@ SUFFIXES = (".mp4", ".gif")
 
 
 def check_video(path: Path) -> None:
-    """Raise `ValueError` for an unknown suffix or a missing package.
-
-    Raises:
-        ValueError: an unknown suffix, or a package that is not installed.
-    """
+    """Raise `ValueError` for an unknown suffix or a package that is not installed."""
     if path.suffix not in SUFFIXES:
         raise UserError(f"{path}: films end in {' or '.join(SUFFIXES)}")
     try:

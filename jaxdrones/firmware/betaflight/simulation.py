@@ -26,11 +26,7 @@ class Simulation:
     """Drone at rest on the ground, with lagging rotors, drag and ground contact."""
 
     def __init__(self, vehicle: str = "racer", hz: int = 1000):
-        """Compile the simulation.
-
-        Args:
-            vehicle: a bundled vehicle or the path of a URDF.
-            hz: steps per second, each of which takes one output of the motors.
+        """Compile the simulation of a vehicle with `hz` steps per second, each of which takes one output of the motors.
 
         Raises:
             UserError: rotors that are not in X configuration, or not alternating in direction.

@@ -59,12 +59,10 @@ class Server(contextlib.AbstractContextManager["Server"]):
         speed: float = 1.0,
         on_row: Callable[[float, Sample, Target], None] = lambda t, sample, target: None,
     ) -> Flown:
-        """Fly in real time and answer packets.
+        """Fly and answer packets for a simulated time (s), by default until it is interrupted.
 
-        Args:
-            duration: simulated time, s; by default until it is interrupted.
-            speed: real-time factor. The clocks of scripts do not follow it.
-            on_row: called with time (s), measurements and set-point every 10 ms of simulated time.
+        The clocks of scripts do not follow the real-time factor `speed`. `on_row` is called with time (s), measurements
+        and set-point every 10 ms of simulated time.
         """
         begin = due = time.monotonic()
         rows = 0

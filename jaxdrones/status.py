@@ -37,7 +37,6 @@ class PlanningError(RuntimeError):
     """Planner without a new command; see `status`."""
 
     def __init__(self, status: Status, planner: str):
-        """Keep the status beside its sentence."""
         super().__init__(f"{planner}: {status.sentence}")
         self.status = status
 

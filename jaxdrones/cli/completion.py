@@ -61,7 +61,6 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Arguments of a parser and of its commands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():

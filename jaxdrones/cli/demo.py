@@ -75,7 +75,6 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _fly(exhibit: Exhibit, options: argparse.Namespace) -> int:
-    """Fly the flight of a bundled policy by its command."""
     words = shlex.split(exhibit.command)
     if words[1] != "fly":
         raise UserError(f"no bundled policy flies {exhibit.name!r}; give --live with forest, for example")

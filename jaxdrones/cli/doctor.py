@@ -138,7 +138,6 @@ def _notes(devices: list[str]) -> list[str]:
 
 
 def _self_tests(extras: dict[str, dict[str, Any]], wrong: list[str]) -> dict[str, str]:
-    """Result of the self-test on every installed backend."""
     from jaxdrones.flights.self_test import self_test
 
     results = {}

@@ -138,7 +138,6 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 
 def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    """Publish a bag at its recorded pace."""
     for name in vars(options):
         if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")

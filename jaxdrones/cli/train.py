@@ -157,7 +157,6 @@ def _on_hosts(options: argparse.Namespace) -> int:
 
 
 def _train(options: argparse.Namespace) -> int:
-    """Parse the request, and train each row of its sweep."""
     begin = time.perf_counter()
     with fail_together():
         if not options.no_figure:
@@ -172,7 +171,6 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _train_row(request: Request, begin: float) -> int:
-    """Lock the folders of a request, and train."""
     with contextlib.ExitStack() as stack:
         with fail_together():
             for folder in dict.fromkeys((request.output, *request.folders.values())):
@@ -189,7 +187,6 @@ def _train_row(request: Request, begin: float) -> int:
 
 
 def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines) -> int:
-    """Train every run in its locked folder, and print the results."""
     print_line = train_output.quiet if request.json else print
     config, what = trainer.recipe.config, described(trainer.recipe) + f", {request.row}" * bool(request.row)
     loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
@@ -221,7 +218,6 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
 
 
 def _compile(request: Request, runs: dict, trainer: Any, what: str, print_line: Callable) -> None:
-    """Compile the programs, and print what is trained and for how long."""
     recipe, config = trainer.recipe, trainer.recipe.config
     if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
         train_output.warn_of_unknown_settings(recipe)
@@ -239,7 +235,6 @@ def _updates(request: Request, config: Any) -> int | None:
 
 
 def _interrupted(request: Request, seed: int, run: Any) -> int:
-    """Print what was kept of an interrupted run."""
     if not (run.folder / "last.json").exists():
         return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
     train_output.draw_curves(request, {seed: run}, run.folder)

@@ -87,7 +87,6 @@ def _view_history(options: argparse.Namespace) -> int:
 
 
 def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[str, Any]) -> int:
-    """Write the page, and with --video a film; open the page with --open, and print what was written."""
     page.save(output)
     files = [output]
     if options.video:
@@ -123,7 +122,6 @@ def _is_flight(path: Path) -> bool:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Width and height from a string such as `1280x720`."""
     width, cross, height = text.partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()) or int(width) % 2 or int(height) % 2:
         raise UserError(f"size of the film is {text!r}; give two even numbers of pixels, for example 1280x720")

@@ -64,7 +64,6 @@ def _first_readings(env: Any, key: jax.Array, world: World, rate: State | None) 
 
 
 def _measured(env: Any, key: jax.Array, world: World, rate: State) -> World:
-    """World with new readings of the sensors."""
     after = measure_sensors(env.sensors, key, world.params, world.drones, rate, world.scene, world.sensors)
     sensors, readings = hold_between(env.sensors, world.step, env.dt, (world.sensors, world.readings), after)
     return world.replace(sensors=sensors, readings=readings)

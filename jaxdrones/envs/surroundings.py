@@ -95,7 +95,6 @@ def _meetings(pos: Vectors, vel: Vectors) -> list[Float[Array, "k n"]]:
 
 
 def _set(observe: Term, count: int, reach: float, name: str, what: str) -> ObservationTerm:
-    """Observation term with the rows of `_meetings`."""
     entries: list[Quantity] = []
     for which in _names(count, what):
         entries += quantities(f"position of the {which}", "m", "world")

@@ -86,7 +86,6 @@ class Recorder:
         self._rows: collections.deque[tuple[Any, ...]] = collections.deque(maxlen=_MOST_ROWS)
 
     def __len__(self) -> int:
-        """Number of rows."""
         return len(self._rows)
 
     def add(self, t: float, now: Sample, target: Any = None) -> None:

@@ -109,7 +109,6 @@ def _settings(network: MLP | Network | OwnNetwork) -> dict[str, Any]:
 
 
 def _restore(path: Path, sidecar: dict[str, Any]) -> Any:
-    """Arrays of a checkpoint as NumPy arrays in dictionaries."""
     content = load_bytes(_arrays_file(path), sidecar)
     try:
         return flax.serialization.msgpack_restore(content)

@@ -191,7 +191,6 @@ def collect(
 
 
 def _started(worlds: Worlds, starts: Starts) -> Worlds:
-    """Worlds at the starts of new episodes."""
     obs, episodes = starts
     hidden_state = jax.tree.map(jnp.zeros_like, worlds.hidden_state)
     return worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(worlds.done), hidden_state=hidden_state)

@@ -156,7 +156,6 @@ class Node:
                 self._flight.commands[i] = hover(self._flight.commands[i], self._flight.state, i)
 
     def _await_clock(self) -> None:
-        """Wait for the clock, then take one step."""
         dt = 1 / self._flight.control_hz
         self._due += dt / self._speed
         while True:

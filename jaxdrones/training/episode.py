@@ -179,7 +179,6 @@ def _held(rows: tuple, before: tuple) -> tuple:
 
 
 def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
-    """One control step per key, in one program."""
     return jax.lax.scan(functools.partial(_step, env, functools.partial(act, policy)), carry, keys)
 
 

@@ -42,7 +42,6 @@ class Run:
     """Folder of the training of one seed."""
 
     def __init__(self, folder: str | os.PathLike):
-        """Refer to a folder, without access to it."""
         self.folder = Path(folder)
 
     @property

@@ -114,7 +114,6 @@ def _draw_bands(axis: Any, t: np.ndarray, signal: np.ndarray) -> None:
 
 
 def _range(values: np.ndarray) -> str:
-    """Range of values as text."""
     ends = [f"{x:,.0f}" if 1e3 <= abs(x) < 1e6 else f"{x:.2g}" for x in (values.min(), values.max())]
     return " to ".join(dict.fromkeys(ends))
 

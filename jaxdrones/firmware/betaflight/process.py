@@ -39,7 +39,6 @@ class Process(contextlib.AbstractContextManager["Process"]):
     """Running program, in a folder of its own."""
 
     def __init__(self, program: Path):
-        """Start the program."""
         self._folder = tempfile.TemporaryDirectory(prefix="jaxdrones-betaflight-")
         self._program = program
         self._output = Path(self._folder.name) / "output.txt"

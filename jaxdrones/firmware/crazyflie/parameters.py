@@ -82,7 +82,6 @@ class Parameters:
         self.toc = Toc({name: e.kind.parameter | _READ_ONLY * e.read_only for name, e in self._entries.items()})
 
     def __getitem__(self, name: str) -> float:
-        """Value of a parameter."""
         return self.values[name]
 
     def answer(self, channel: int, data: bytes) -> bytes:

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
 from jaxdrones.adapters import pictures
-from jaxdrones.adapters.session import SEEDS, Session, as_env, flat, rewarding
+from jaxdrones.adapters.session import SEEDS, Session, as_env, as_numpy, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.arguments import Count, checked
@@ -226,9 +225,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return mask
 
     def _out(self, tree: Any) -> Any:
-        if not self._numpy:
-            return tree
-        return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)
+        return as_numpy(tree) if self._numpy else tree
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
         """Infos with gymnasium's masks `_name` of valid worlds."""

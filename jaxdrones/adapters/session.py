@@ -32,12 +32,12 @@ class Session:
         """Start an episode; return the observation."""
         self._key, self.world, obs = self.env.compiled(begin)(np.uint32(seed % SEEDS))
         self.running = True
-        return _numpy(obs)
+        return as_numpy(obs)
 
     def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
         """One control step with a validated action (n, a); the result is that of the environment."""
         self.world, outcome = self.env.compiled(_advance)(self._key, self.world, action)
-        obs, reward, terminated, truncated, info = _numpy(outcome)
+        obs, reward, terminated, truncated, info = as_numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
         self.running = not (terminated or truncated)
         return obs, reward, terminated, truncated, info
@@ -136,6 +136,6 @@ def _advance(env: Env, key: jax.Array, world: World, action: np.ndarray) -> tupl
     return world, (obs, *rest)
 
 
-def _numpy(tree: Any) -> Any:
+def as_numpy(tree: Any) -> Any:
     """Copy to NumPy, real arrays in single precision."""
     return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)

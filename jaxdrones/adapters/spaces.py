@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
@@ -26,15 +27,6 @@ def action_of_drone(env: Env) -> spaces.Box:
     return spaces.Box(-1, 1, (env.action_size,), np.float32)
 
 
-def stacked(space: spaces.Space, n: int) -> spaces.Space:
-    """Space of n copies, with a leading axis."""
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({name: stacked(entry, n) for name, entry in space.items()})
-    assert isinstance(space, spaces.Box)
-    low, high = (np.broadcast_to(x, (n, *space.shape)) for x in (space.low, space.high))
-    return spaces.Box(low, high, dtype=space.low.dtype.type)
-
-
 class Layout:
     """Layout of observations and actions: a single drone without drone axis; a team with it, or as a dict by drone."""
 
@@ -49,8 +41,8 @@ class Layout:
         elif n == 1:
             self.observation, self.action = observation_of_drone(env), action_of_drone(env)
         else:
-            self.observation = stacked(observation_of_drone(env), n)
-            self.action = stacked(action_of_drone(env), n)
+            self.observation = batch_space(observation_of_drone(env), n)
+            self.action = batch_space(action_of_drone(env), n)
 
     def arrange(self, tree: Any, axis: int = 0) -> Any:
         """Convert arrays with drones along `axis` to this layout."""

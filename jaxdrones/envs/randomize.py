@@ -17,13 +17,12 @@ from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
+from jaxdrones.tasks.task import Randomization
 
 DELAY = "delay"
 """Key of `Params.aux`: random delay of an episode, control steps."""
 
 Field = Annotated[str, choice("parameter", Params.__dataclass_fields__)]
-Randomization = Callable[[jax.Array, Params], Params]
-"""(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> measured state."""
 

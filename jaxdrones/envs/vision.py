@@ -18,9 +18,8 @@ from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene, render
 from jaxdrones.sensing.camera import OneCamera
 from jaxdrones.state import State
-from jaxdrones.tasks.task import World
+from jaxdrones.tasks.task import IMAGES, World
 
-IMAGES = ("rgb", "depth", "segmentation")
 _PIXELS = 16384  # computed at a time, to fit in a cache
 _PIXELS_OF_STARTS = 2048  # the same for starts of episodes, which are few in a step
 

@@ -10,11 +10,10 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.control import Setpoint, firmware_pid
-from jaxdrones.dynamics.integrators import midpoint
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import PERIOD, FlightLog
-from jaxdrones.flights.open_loop import equations_of_motion, lagged_rpm
+from jaxdrones.flights.open_loop import lagged_rpm, moved
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.state import State
 from jaxdrones.thrust_curves import thrust_at
@@ -146,17 +145,15 @@ def simulate(
 ) -> tuple[State, Float[Array, "K 4"]]:
     """States, (K, ...) on every array, and PWM (0 to 65535) of a closed-loop simulation."""
     params, instruments = vehicle.params, vehicle.instruments
-    team = jax.tree.map(lambda x: x[None], params)
-    dt, derivative = PERIOD / _SUBSTEPS, equations_of_motion(jnp.zeros(4))
+    dt = PERIOD / _SUBSTEPS
 
     def substep(carry, setpoint, battery):
         memory, state = carry
         memory, command = firmware_pid.pwm(gains, memory, instruments.estimate(state), setpoint, battery, dt=dt)
         thrust = motors.thrust(command.pwm / FULL_PWM * instruments.motor_supply(battery, inputs.sag))
         rpm = lagged_rpm(params, state.rpm, thrust, dt)
-        world = jax.tree.map(lambda x: x[None], state.replace(rpm=rpm))
-        after = midpoint(lambda s: derivative(team, s, rpm[None]), world, dt)
-        return (memory, _above_ground(inputs, jax.tree.map(lambda x: x[0], after))), command.pwm
+        after = moved(params, state.replace(rpm=rpm), rpm, jnp.zeros(4), dt)
+        return (memory, _above_ground(inputs, after)), command.pwm
 
     def row(carry, row_inputs):
         after, pwm = jax.lax.scan(lambda carry, _: substep(carry, *row_inputs), carry, length=_SUBSTEPS)

@@ -12,7 +12,7 @@ from jaxdrones.dynamics.aero import drag
 from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.integrators import midpoint
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
-from jaxdrones.engine.explicit import Derivative, make_derivative
+from jaxdrones.engine.explicit import make_derivative
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import PERIOD, FlightLog
 from jaxdrones.flights.vehicle import Vehicle
@@ -78,15 +78,10 @@ def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"
     """
     params, instruments = vehicle.params, vehicle.instruments
     speed, rate = _rotor_speed(vehicle, command, motors)
-    team = jax.tree.map(lambda x: x[None], params)
     state = start.replace(quat=instruments.true_attitude(start.quat), rpm=speed[0])
 
     def advance(state: State, rotors: tuple[Array, Array]) -> tuple[State, State]:
-        speed, rate = rotors
-        derivative = equations_of_motion(rate)
-        world = jax.tree.map(lambda x: x[None], state)
-        after = midpoint(lambda s: derivative(team, s, speed[None]), world, PERIOD)
-        after = jax.tree.map(lambda x: x[0], after)
+        after = moved(params, state, *rotors, PERIOD)
         return after, after
 
     _, states = jax.lax.scan(advance, state, (speed, rate))
@@ -190,13 +185,12 @@ def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]
     return jnp.sum(jnp.stack(terms), axis=0)
 
 
-def equations_of_motion(rpm_rate: Float[Array, "4"]) -> Derivative:
-    """Equations of motion of a team of one drone with given rotor speeds and rates, RPM/s."""
-
-    def prescribed(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
-        return command, rpm_rate
-
-    return make_derivative(effects=EFFECTS, rotors=prescribed)
+def moved(params: Params, state: State, rpm: Float[Array, "4"], rpm_rate: Float[Array, "4"], dt: float) -> State:
+    """State of one drone after a step (s) of the midpoint method with given rotor speeds (RPM) and rates (RPM/s)."""
+    derivative = make_derivative(effects=EFFECTS, rotors=lambda params, state, command: (command, rpm_rate))
+    team, world = jax.tree.map(lambda x: x[None], (params, state))
+    after = midpoint(lambda s: derivative(team, s, rpm[None]), world, dt)
+    return jax.tree.map(lambda x: x[0], after)
 
 
 def lagged_rpm(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], dt: float) -> Float[Array, "4"]:

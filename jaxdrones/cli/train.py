@@ -182,7 +182,7 @@ def _train_row(request: Request, begin: float) -> int:
                 if run.started and request.resume:
                     loop.check_resumable(trainer, run)
             for run in (*runs.values(), Run(request.output)):
-                trainer.prepare(run)
+                run.prepare(trainer.disk_size)
         return _train_runs(request, runs, trainer, train_output.Deadlines(request, begin))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -34,7 +34,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
     """State before the first update."""
     key, policy_key = jax.random.split(key)
     policy = result.init_policy(policy_key, env, config, network)
-    opt_state = _optimizer(config).init(policy.params)
+    opt_state = optimizer(config).init(policy.params)
     worlds = collect.empty_worlds(env, config.worlds, policy)
     return result.TrainState(jnp.zeros((), jnp.int32), key, policy, opt_state, worlds)
 
@@ -56,7 +56,30 @@ def gradient_step(
 
     The policy acts for all drones by `act`; the rewards of the drones in `learning` count.
     """
-    key, start_key, restart_key, collect_key = jax.random.split(state.key, 4)
+    key, *keys = jax.random.split(state.key, 4)
+
+    def cost(policy: Policy, trajectory: collect.Trajectory) -> Array:
+        return -jnp.mean(discounted_rewards(trajectory, config.gamma)[..., learning])
+
+    state, _, metrics = policy_step(env, config, state, keys, cost, act=act)
+    return state.replace(key=key), metrics
+
+
+def policy_step(
+    env: Env,
+    config: GradientConfig,
+    state: S,
+    keys: Sequence[jax.Array],
+    cost: Callable[[Policy, collect.Trajectory], Array],
+    *,
+    act: Callable[[Policy], collect.Act] = collect.deterministic,
+    privileged: bool = False,
+) -> tuple[S, collect.Trajectory, dict[str, Array]]:
+    """Simulate a trajectory of all worlds and take one gradient step of the policy on its cost.
+
+    The keys are those of starts, restarts and steps. The state keeps its own key.
+    """
+    start_key, restart_key, collect_key = keys
     progress = collect.progress_of(env, config, state.step)
     starts = collect.draw_starts(start_key, env, config.worlds, progress)
     worlds = collect.restart(restart_key, state.worlds, starts, config.restart_fraction)
@@ -64,29 +87,32 @@ def gradient_step(
     between_steps = gradient_between_steps(config)
 
     def loss(params):
+        policy = state.policy.replace(params=params)
         after, trajectory = collect.collect(
             collect_key,
             env,
-            act(state.policy.replace(params=params)),
+            act(policy),
             worlds,
             config.horizon,
             between_steps=between_steps,
+            privileged=privileged,
         )
-        return -jnp.mean(discounted_rewards(trajectory, config.gamma)[..., learning]), (after, trajectory)
+        return cost(policy, trajectory), (after, trajectory)
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
-    step, opt_state = _optimizer(config).update(gradient, state.opt_state)
+    step, opt_state = optimizer(config).update(gradient, state.opt_state)
     obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
     policy = state.policy.replace(params=optax.apply_updates(state.policy.params, step)).with_obs_stats(obs_stats)
     norm = optax.tree.norm(gradient)
     metrics = {"gradient_norm": norm, "nonfinite_gradients": result.count_nonfinite(norm)}
     worlds, measured = measure(env, config, state.step, worlds, trajectory)
-    state = state.replace(step=state.step + 1, key=key, policy=policy, opt_state=opt_state, worlds=worlds)
-    return state, metrics | measured
+    state = state.replace(step=state.step + 1, policy=policy, opt_state=opt_state, worlds=worlds)
+    return state, trajectory, metrics | measured
 
 
 train = result.make_train(Config, init, update)
 
 
-def _optimizer(config: Config) -> optax.GradientTransformation:
+def optimizer(config: GradientConfig) -> optax.GradientTransformation:
+    """Optimizer of the policy."""
     return result.cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)

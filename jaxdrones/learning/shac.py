@@ -15,11 +15,10 @@ from jaxdrones import arguments
 from jaxdrones.arguments import checked
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning import collect, result, sharding
+from jaxdrones.learning import bptt, collect, result, sharding
 from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
-from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
+from jaxdrones.learning.gradients import GradientConfig
 from jaxdrones.learning.layers import expand
-from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import advantages, discounted_rewards
 
@@ -68,7 +67,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
         step=jnp.zeros((), jnp.int32),
         key=key,
         policy=policy,
-        opt_state=_policy_optimizer(config).init(policy.params),
+        opt_state=bptt.optimizer(config).init(policy.params),
         worlds=collect.empty_worlds(env, config.worlds, policy),
         critic=critic,
         target_critic=critic,
@@ -78,51 +77,28 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds, take one gradient step of the policy, then fit the critic."""
-    key, start_key, restart_key, collect_key, critic_key = jax.random.split(state.key, 5)
-    progress = collect.progress_of(env, config, state.step)
-    starts = collect.draw_starts(start_key, env, config.worlds, progress)
-    worlds = collect.restart(restart_key, state.worlds, starts, config.restart_fraction)
-    env = with_gradient(env, config)
-    between_steps = gradient_between_steps(config)
+    key, *keys, critic_key = jax.random.split(state.key, 5)
     weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)
 
-    def loss(params):
-        policy = state.policy.replace(params=params)
-        after, trajectory = collect.collect(
-            collect_key,
-            env,
-            collect.deterministic(policy),
-            worlds,
-            config.horizon,
-            between_steps=between_steps,
-            privileged=config.privileged_critic,
-        )
+    def cost(policy: Policy, trajectory: collect.Trajectory) -> Array:
         bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1]) & ~trajectory.was_done
         final_obs = _final_observation(policy, _at(bootstrap, trajectory))
         terminal_value = weight * config.gamma * discounted_value(config, state.target_critic, final_obs)
         reward = trajectory.reward + jnp.where(bootstrap, terminal_value[None], 0)
         returns = jnp.sum(discounted_rewards(trajectory.replace(reward=reward), config.gamma), axis=0)
-        return -jnp.mean(returns) / config.horizon, (after, trajectory)
+        return -jnp.mean(returns) / config.horizon
 
-    (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
-    step, opt_state = _policy_optimizer(config).update(gradient, state.opt_state)
+    after, trajectory, metrics = bptt.policy_step(env, config, state, keys, cost, privileged=config.privileged_critic)
     replicated = sharding.REPLICATED
     fit = sharding.map_worlds(
         functools.partial(_fit_critic, config), (replicated, replicated, sharding.STEPS), replicated
     )
     critic, critic_opt_state, critic_metrics = fit(critic_key, state.replace(worlds=None), trajectory)
     target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
-    obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
-    policy = state.policy.replace(params=optax.apply_updates(state.policy.params, step)).with_obs_stats(obs_stats)
-    norm = optax.tree.norm(gradient)
-    metrics = {
-        "gradient_norm": norm,
-        "critic_loss": critic_metrics["loss"],
-        "nonfinite_gradients": result.count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
-    }
-    worlds, measured = measure(env, config, state.step, worlds, trajectory)
-    state = TrainState(state.step + 1, key, policy, opt_state, worlds, critic, target_critic, critic_opt_state)
-    return state, metrics | measured
+    nonfinite = metrics["nonfinite_gradients"] + critic_metrics["nonfinite_gradients"]
+    metrics |= {"critic_loss": critic_metrics["loss"], "nonfinite_gradients": nonfinite}
+    after = after.replace(key=key, critic=critic, target_critic=target_critic, critic_opt_state=critic_opt_state)
+    return after, metrics
 
 
 train = result.make_train(Config, init, update)
@@ -167,10 +143,6 @@ def _fit_critic(config: Config, key: jax.Array, state: TrainState, trajectory: c
     carry = (state.critic, state.critic_opt_state)
     (critic, opt_state), (costs, norms) = jax.lax.scan(step, carry, jax.random.split(key, config.critic_steps))
     return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": result.count_nonfinite(norms)}
-
-
-def _policy_optimizer(config: Config) -> optax.GradientTransformation:
-    return result.cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)
 
 
 def _critic_optimizer(config: Config) -> optax.GradientTransformation:

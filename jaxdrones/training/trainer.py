@@ -19,7 +19,7 @@ from jaxdrones.limits import check_memory
 from jaxdrones.training import algorithms
 from jaxdrones.training.plan import check_stop_at
 from jaxdrones.training.recipe import Recipe
-from jaxdrones.training.run import Run, size_of
+from jaxdrones.training.run import size_of
 
 _DISK_FACTOR = 4  # number of training states that must fit on the disk
 
@@ -36,6 +36,8 @@ class Trainer:
         self.learner = algorithms.learner(recipe.algorithm)
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
+        self.disk_size = _DISK_FACTOR * size_of(self.shapes)
+        """Bytes that a run must be able to write."""
         check_episodes(self.env, episodes)
         check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         actions = recipe.config.worlds * self.env.drones * self.env.action_size * jnp.zeros(()).dtype.itemsize
@@ -49,25 +51,17 @@ class Trainer:
         self.compile_seconds = time.perf_counter() - start
 
     def compile(self) -> None:
-        """Compile the programs, the updates beside the others."""
+        """Compile the programs, the updates beside the others: `start(key)`, `evaluate(policy, key)` and `advance`."""
         start = time.perf_counter()
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         init = compilation.jit(self._init, self.practice_env, in_shardings=same, out_shardings=state)
         with ThreadPoolExecutor(1) as beside:
             with jax.set_mesh(self.mesh):
                 updates = beside.submit(self._traced.lower().compile)
-                self._start = init.lower(jax.random.key(0)).compile()
+                self.start = init.lower(jax.random.key(0)).compile()
             self.evaluate = compile_evaluation(self.env, self.shapes.policy, self.episodes, self.mesh.local_devices)
             self._advance = updates.result()
         self.compile_seconds += time.perf_counter() - start
-
-    def prepare(self, run: Run) -> None:
-        """Create the folder of a run and check that its files can be written."""
-        run.prepare(_DISK_FACTOR * size_of(self.shapes))
-
-    def start(self, key: jax.Array) -> Any:
-        """Training state before the first update."""
-        return self._start(key)
 
     def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
         """Run at most `MAX_CALL` updates in one call: the next state, and (updates,) of every metric."""

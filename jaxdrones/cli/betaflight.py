@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.arguments import number, whole
-from jaxdrones.cli.common import INTERRUPTED, check_writable, folder, print_error, print_warning
+from jaxdrones.cli.common import check_writable, folder, print_error, print_warning, until_interrupted
 from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import listed, print_results
@@ -78,7 +78,6 @@ def _run(options: argparse.Namespace) -> int:
     _check(options)
     file = options.output / "log.npz"
     check_writable(file)
-    interrupted, lost = False, None
     running = connect_msp()
     program = None if running else betaflight.find_program()
     if running:
@@ -100,12 +99,7 @@ def _run(options: argparse.Namespace) -> int:
             on_row=lambda t, now, sticks: recorder.add(t, now, target() if target else None),
             warn=print_warning,
         )
-        try:
-            flight.run(options.duration)
-        except KeyboardInterrupt:
-            interrupted = True
-        except betaflight.BetaflightLost as error:
-            lost = str(error)
+        failed = until_interrupted(lambda: flight.run(options.duration), betaflight.BetaflightLost)
     report: dict[str, Any] = vars(flight.flown) | {"real_time_factor": round(flight.flown.real_time_factor, 3)}
     if len(recorder):
         about = f"betaflight: {options.vehicle}{', real time' if options.real_time else ''}"
@@ -120,9 +114,7 @@ def _run(options: argparse.Namespace) -> int:
         say(f"wrote {file}")
     report = {name: round(x, 4) if isinstance(x, float) else x for name, x in report.items()}
     print_results(options, report, listed(report))
-    if lost:
-        return print_error(lost, 1)
-    return print_error("interrupted", INTERRUPTED) if interrupted else 0
+    return print_error(*failed) if failed else 0
 
 
 def _check(options: argparse.Namespace) -> None:

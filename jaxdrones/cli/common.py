@@ -8,7 +8,9 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -115,6 +117,17 @@ def _explained(error: BaseException) -> str | None:
         machine.devices()
     except UserError as missing:
         return str(missing)
+    return None
+
+
+def until_interrupted(fly: Callable[[], Any], *lost: type[Exception]) -> tuple[str, int] | None:
+    """Run a flight; message and exit code of one that was interrupted or lost, to be printed after its results."""
+    try:
+        fly()
+    except KeyboardInterrupt:
+        return "interrupted", INTERRUPTED
+    except lost as error:
+        return str(error), DIVERGED
     return None
 
 

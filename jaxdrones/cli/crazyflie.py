@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from jaxdrones.arguments import number, whole
-from jaxdrones.cli.common import INTERRUPTED, check_writable, print_error
+from jaxdrones.cli.common import check_writable, print_error, until_interrupted
 from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
@@ -42,19 +42,17 @@ def add(commands) -> None:
 def _run(options: argparse.Namespace) -> int:
     file = options.output / "log.npz"
     check_writable(file)
-    recorder, interrupted = Recorder(), False
-    vehicle = Vehicle(options.vehicle)
+    recorder, vehicle = Recorder(), Vehicle(options.vehicle)
     with Server(Crazyflie(vehicle), options.port) as server:
         if not options.json:
             print(f"a Crazyflie ({options.vehicle}) is at udp://127.0.0.1:{server.port}; Ctrl-C ends it", flush=True)
-        try:
-            server.run(options.duration, options.speed, lambda t, now, target: recorder.add(t, now))
-        except KeyboardInterrupt:
-            interrupted = True
+        failed = until_interrupted(
+            lambda: server.run(options.duration, options.speed, lambda t, now, target: recorder.add(t, now))
+        )
     report = vars(server.flown) | {"real_time_factor": round(server.flown.real_time_factor, 3)}
     files = [str(file)] if len(recorder) else []
     if files:
         conditions = {"vehicle": options.vehicle, "controller": "firmware_pid"}
         save_npz(recorder.log(vehicle.params, conditions, f"crazyflie: {options.vehicle}, flown by cflib"), file)
     print_results(options, report | {"files": files}, listed(report), f"wrote {file}" if files else "nothing was flown")
-    return print_error("interrupted", INTERRUPTED) if interrupted else 0
+    return print_error(*failed) if failed else 0

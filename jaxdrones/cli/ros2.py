@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
-from jaxdrones.cli.common import DIVERGED, INTERRUPTED, folder, print_error, print_warning
+from jaxdrones.cli.common import folder, print_error, print_warning, until_interrupted
 from jaxdrones.cli.options import add_backend, add_drones, add_vehicle
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
@@ -94,17 +94,9 @@ def _run(options: argparse.Namespace) -> int:
                 recorder=recorder,
                 warn=print_warning,
             )
-            interrupted, lost = False, None
-            try:
-                node.run(options.duration)
-            except KeyboardInterrupt:
-                interrupted = True
-            except PeerLost as error:
-                lost = str(error)
+            failed = until_interrupted(lambda: node.run(options.duration), PeerLost)
         _print(options, vars(node.flown) | {"simulated_s": simulation.ns / 1e9})
-    if lost:
-        return print_error(lost, DIVERGED)
-    return print_error("interrupted", INTERRUPTED) if interrupted else 0
+    return print_error(*failed) if failed else 0
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:

@@ -51,22 +51,25 @@ def difference(params: Params, state: State, reference: State) -> Float[Array, "
     """Difference between two states of one drone as a vector.
 
     Returns:
-        (d,) in this order: position, m, world; rotation from the reference to the state, twice the vector part of its
-        quaternion (in the limit of small angles the rotation vector, rad), body; velocity, m/s, world; angular
-        velocity, rad/s, body; rotor speeds over that of hover; states of models in their own units. d is 16 without
-        models.
+        (d,) in this order: position, m, world; `small_turn` from the reference to the state, rad, body; velocity, m/s,
+        world; angular velocity, rad/s, body; rotor speeds over that of hover; states of models in their own units. d is
+        16 without models.
     """
-    error = rotation.multiply(rotation.conjugate(reference.quat), state.quat)
-    turn = jnp.where(error[3] < 0, -2, 2) * error[:3]
     parts = (
         state.pos - reference.pos,
-        turn,
+        small_turn(reference.quat, state.quat),
         state.vel - reference.vel,
         state.omega - reference.omega,
         (state.rpm - reference.rpm) / command_unit(params),
         jax.tree.map(jnp.subtract, state.aux, reference.aux),
     )
     return ravel_pytree(parts)[0]
+
+
+def small_turn(quat: Float[Array, "4"], after: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Twice the vector part of the rotation between two attitudes; in the limit of small angles rad, body."""
+    error = rotation.multiply(rotation.conjugate(quat), after)
+    return jnp.where(error[3] < 0, -2, 2) * error[:3]
 
 
 def displaced(params: Params, state: State, vector: Float[Array, " d"]) -> State:

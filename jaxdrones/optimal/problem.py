@@ -12,7 +12,7 @@ from jaxdrones.checks import check_shape, is_concrete
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
-from jaxdrones.optimal.coordinates import command_unit
+from jaxdrones.optimal.coordinates import command_unit, small_turn
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -71,7 +71,7 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     attitudes over `dt` (s). The angular velocity of the H + 1 >= 3 setpoints is not used; `aux` are states of models.
     """
     quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
-    omega = _with_last(jax.vmap(_turn)(quat[:-1], quat[1:]) / dt)
+    omega = _with_last(jax.vmap(small_turn)(quat[:-1], quat[1:]) / dt)
     omega_rate = _with_last(jnp.diff(omega[:-1], axis=0) / dt, 2)
     rpm = jax.vmap(lambda f, w, a: rpm_from_wrench(params, f, params.inertia * a + cross(w, params.inertia * w)))(
         thrust, omega, omega_rate
@@ -86,12 +86,6 @@ def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> t
     force = params.mass * (acc + along_z(params.gravity))
     axes = attitude.from_thrust(force, yaw)
     return rotation.from_matrix(jnp.stack(axes, axis=-1)), safe_sqrt(dot(force, force))
-
-
-def _turn(quat: Float[Array, "4"], after: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Small rotation between two attitudes, rad, body."""
-    error = rotation.multiply(rotation.conjugate(quat), after)
-    return jnp.where(error[3] < 0, -2, 2) * error[:3]
 
 
 def _with_last(x: Float[Array, "k 3"], times: int = 1) -> Float[Array, "_ 3"]:

@@ -19,7 +19,7 @@ from jaxdrones.control import (
     velocity,
 )
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.team import for_team
+from jaxdrones.control.single import for_team
 
 CONTROLLERS = {
     "pid": pid,

@@ -153,7 +153,8 @@ def _fly(
     first = memory.running == 0
 
     pos_error = setpoint.pos - state.pos
-    pos_integral = _limited(memory.pos_integral + dt * pos_error, gains.max_pos_integral)
+    limit = gains.max_pos_integral
+    pos_integral = jnp.clip(memory.pos_integral + dt * pos_error, -limit, limit)
     force = gains.pos_p * pos_error + gains.pos_d * (setpoint.vel - state.vel) + gains.pos_i * pos_integral
     force = force + gains.mass * setpoint.acc + vector.along_z(gains.weight)
     axes, target = rotation.axes(state.quat), attitude.from_thrust(force, setpoint.yaw)
@@ -162,7 +163,8 @@ def _fly(
     gyro = jnp.where(first, settled(state.omega, gains.gyro_cutoff, dt), memory.gyro)
     gyro, omega = low_pass(gyro, state.omega, gains.gyro_cutoff, dt)
     error = 2 * attitude.error(axes, target)
-    integral = _limited(memory.attitude_integral - dt * error, gains.max_attitude_integral)
+    limit = gains.max_attitude_integral
+    integral = jnp.clip(memory.attitude_integral - dt * error, -limit, limit)
     rate_error = setpoint.omega - omega
     change = (rate_error - jnp.where(first, rate_error, memory.rate_error)) / dt
     torque = -gains.attitude_p * error + gains.attitude_i * integral
@@ -177,7 +179,3 @@ def _fly(
         running=jnp.ones_like(memory.running),
     )
     return memory, target, thrust, jnp.where(flying, jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE), 0)
-
-
-def _limited(x: Float[Array, "3"], limit: Float[Array, "3"]) -> Float[Array, "3"]:
-    return jnp.clip(x, -limit, limit)

@@ -1,6 +1,9 @@
-"""Annotations of arguments that are those of one drone, which a team would broadcast."""
+"""One drone and a team: annotations of arguments of one drone, which a team would broadcast; memory of a team."""
 
 from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
 
 from jaxdrones.checks import check_shape
 from jaxdrones.control.setpoint import Setpoint
@@ -24,3 +27,8 @@ def _of_one_drone(name: str, value: Any) -> None:
 OneParams = Annotated[Params, _of_one_drone]
 OneState = Annotated[State, _of_one_drone]
 OneSetpoint = Annotated[Setpoint, _of_one_drone]
+
+
+def for_team(memory: Any, n: int) -> Any:
+    """Memory of a controller for each of `n` drones, with a leading drone axis on every array."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), memory)

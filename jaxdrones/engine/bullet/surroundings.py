@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxdrones.engine.bullet.shapes import shape_of
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene, Urdf
+from jaxdrones.sensing.files import Mesh
+from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 _STATIC = 2  # Bullet's collision group of bodies that do not move, which do not collide with each other
 _GROUND_FRICTION = 1.0  # as in gym-pybullet-drones (2021)
@@ -113,12 +115,28 @@ class Surroundings:
         if isinstance(obstacle, Urdf):
             with quiet():
                 return p.loadURDF(str(obstacle.path), pos, quat, useFixedBase=True, physicsClientId=self.id)
-        shape = shape_of(p, obstacle)
+        shape = _shape_of(p, obstacle)
         collision = p.createCollisionShape(**shape, physicsClientId=self.id)
         if "height" in shape:
             shape["length"] = shape.pop("height")  # Bullet has two names for it
         visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
         return p.createMultiBody(0, collision, visual, pos, quat, physicsClientId=self.id)
+
+
+def _shape_of(p: ModuleType, obstacle: Any) -> dict[str, Any]:
+    """Arguments of `createCollisionShape` for a single concrete obstacle."""
+    match obstacle:
+        case Box(size=size):
+            return dict(shapeType=p.GEOM_BOX, halfExtents=[edge / 2 for edge in size])
+        case Sphere(radius=radius):
+            return dict(shapeType=p.GEOM_SPHERE, radius=radius)
+        case Cylinder(radius=radius, height=height):
+            return dict(shapeType=p.GEOM_CYLINDER, radius=radius, height=height)
+        case Capsule(radius=radius, height=height):
+            return dict(shapeType=p.GEOM_CAPSULE, radius=radius, height=height)
+        case Mesh(path=path, scale=scale):
+            return dict(shapeType=p.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3)
+    raise UserError(f"Bullet has no shape for a {type(obstacle).__name__}; leave it out of the scene")
 
 
 @contextlib.contextmanager

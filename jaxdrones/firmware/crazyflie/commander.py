@@ -88,9 +88,7 @@ class Commander:
         if self._streamed is None:
             return self.high_level.target(t)
         age = t - self._time
-        if self._valid_until is not None and t <= self._valid_until:
-            return self._streamed
-        if age < LEVEL_AFTER:
+        if age < LEVEL_AFTER or (self._valid_until is not None and t <= self._valid_until):
             return self._streamed
         if age < OFF_AFTER:
             return _level(self._streamed)

@@ -71,11 +71,6 @@ class Crazyflie:
         return self.rows * PERIOD
 
     @property
-    def clients(self) -> int:
-        """Number of clients that are heard."""
-        return len(self._clients)
-
-    @property
     def status(self) -> int:
         """State bits of the supervisor."""
         planned = self.high_level.trajectory is not None

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxdrones as jd
-from benchmarks.common import success_rate
+from benchmarks.common import outcome, success_rate
 from benchmarks.leaderboard_scenarios import near
 from jaxdrones import assets, vehicles
 from jaxdrones.envs import Env
@@ -75,9 +75,7 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     rows = []
     for (name, env), policy in itertools.product(envs.items(), options.policies):
         report = evaluate(env, jd.make_policy(policy, env), jax.random.key(SEED), options.episodes)
-        error = report.final_error_percentiles
-        row = {"condition": name, "policy": policy, "success": report.success, "interval": report.success_interval}
-        rows.append(row | {"error p50": error[50], "error p99": error[99]})
+        rows.append({"condition": name, "policy": policy} | outcome(report))
     lines = ["condition                | policy      | success [95 % interval]  | error cm p50    p99"]
     lines += [
         f"{row['condition']:24} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"

@@ -5,11 +5,13 @@ import statistics
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 
 from jaxdrones.cli.machine import processor, versions
 from jaxdrones.cli.throughput import seconds as seconds
+from jaxdrones.learning.evaluation import Report
 
 
 def about() -> dict[str, object]:
@@ -40,6 +42,12 @@ def first_call(function, *arguments) -> float:
     return time.perf_counter() - start
 
 
+def outcome(report: Report) -> dict[str, Any]:
+    """Success with its interval, and error in the end, m, for a row."""
+    errors = {f"error p{q}": report.final_error_percentiles[q] for q in (50, 99)}
+    return {"success": report.success, "interval": report.success_interval} | errors
+
+
 def success_rate(success: float | None, interval: tuple[float, float] | None) -> str:
     """A success rate with its interval, or why there is none."""
     if success is None:
@@ -53,7 +61,7 @@ Program = Callable[[], object]
 """Does its work and returns what it made; arrays of JAX are waited for."""
 
 
-def in_turn(programs: dict[str, Program], repeats: int, shortest: float = 0.05) -> dict[str, dict[str, float]]:
+def in_turn(programs: Mapping[Any, Program], repeats: int, shortest: float = 0.05) -> dict[Any, dict[str, float]]:
     """Median, best and spread (upper less lower quartile) of the seconds of each, warmed up.
 
     A turn takes `shortest` s, in many calls if need be.

@@ -6,7 +6,6 @@ gymnasium environment.
 
 import argparse
 import dataclasses
-import time
 
 import gymnasium
 import jax
@@ -81,7 +80,7 @@ def vector(options) -> float:
     envs = gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=options.worlds)
     envs.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, envs.action_space.shape).astype(np.float32)
-    return options.worlds * _rate(lambda: envs.step(actions), options)
+    return options.worlds * _rate(lambda: envs.step(actions)[0], options)
 
 
 def single(options) -> float:
@@ -99,11 +98,4 @@ def single(options) -> float:
 
 def _rate(step, options) -> float:
     """Calls per second: the median of repeats of 100 calls."""
-    step()
-    rates = []
-    for _ in range(options.repeats):
-        start = time.perf_counter()
-        for _ in range(100):
-            step()
-        rates.append(100 / (time.perf_counter() - start))
-    return float(np.median(rates))
+    return 100 / seconds(lambda: [step() for _ in range(100)], repeats=options.repeats)["median"]

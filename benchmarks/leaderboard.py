@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import tables
-from benchmarks.common import about
+from benchmarks.common import about, outcome
 from benchmarks.leaderboard_pilots import PILOTS, Mpc, Obtained, Pilot
 from benchmarks.leaderboard_scenarios import SCENARIOS, SCORED, TUNING
 from jaxdrones.envs import Env
@@ -101,10 +101,7 @@ def score(env: Env, policy: Any, starts: int) -> Row:
     steps = came.mean_length / env.dt
     return {
         "distinct": came.distinct_episodes,
-        "success": came.success,
-        "interval": came.success_interval,
-        "error p50": came.final_error_percentiles[50],
-        "error p99": came.final_error_percentiles[99],
+        **outcome(came),
         "effort": math.sqrt(came.mean_return / steps),
         "ends": came.end_rates,
     }

@@ -9,7 +9,7 @@ import time
 
 import jax
 
-from benchmarks.common import success_rate
+from benchmarks.common import outcome, success_rate
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.learning import compilation, evaluate
 from jaxdrones.training.algorithms import ALGORITHMS, learner
@@ -70,10 +70,7 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
                 "steps": config.updates * config.worlds * config.horizon * env.drones,
                 "run": run,
                 "run CPU": run_cpu,
-                "success": came.success,
-                "interval": came.success_interval,
-                "error p50": came.final_error_percentiles[50],
-                "error p99": came.final_error_percentiles[99],
+                **outcome(came),
                 "rms": came.rms_error,
                 "metrics": {name: round(x, 4) for name, x in came.final_metrics.items()} | came.end_rates,
             }

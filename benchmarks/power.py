@@ -4,13 +4,14 @@ A world is one Crazyflie with drag and lagging rotors; commands change at every 
 """
 
 import argparse
-import time
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
+from benchmarks.common import in_turn
 
 PLAIN = "lagging rotors"
 
@@ -29,18 +30,12 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         for name, case in cases().items()
         for how in ("over_worlds", "jax.vmap")
     }
-    times: dict = {key: [] for key in programs}
-    for _ in range(1 + options.repeats):
-        for key, (fly, rpm) in programs.items():
-            start = time.perf_counter()
-            jax.block_until_ready(fly(rpm))
-            times[key].append(time.perf_counter() - start)
     rows = []
-    for (name, how), all_times in times.items():
-        median, plain = (np.median(x[1:]) for x in (all_times, times[PLAIN, how]))
-        best = min(all_times[1:]) / min(times[PLAIN, how][1:])
-        ns = 1e9 * median / options.steps / options.worlds
-        rows.append({"case": name, "how": how, "ns": ns, "ratio": median / plain, "ratio of best": best})
+    times = in_turn(programs, options.repeats, shortest=0)
+    for (name, how), taken in times.items():
+        plain = times[PLAIN, how]
+        ratios = {"ratio": taken["median"] / plain["median"], "ratio of best": taken["best"] / plain["best"]}
+        rows.append({"case": name, "how": how, "ns": 1e9 * taken["median"] / options.steps / options.worlds} | ratios)
     lines = []
     lines.append(f"{options.worlds} worlds, {options.steps} steps of 1/240 s, semi-implicit Euler, drag, float32")
     lines.append("case | many worlds | ns of a drone-step, median | over that of lagging rotors: medians, bests")
@@ -73,7 +68,7 @@ def cases() -> dict:
 
 
 def program(case, how: str, options):
-    """A function of the commands of many worlds that flies a case, and the commands."""
+    """A flight of a case in many worlds."""
     params, arguments, mean = case
     team = jd.repeat(params, 1)
     step = jd.make_step(**{"effects": (jd.drag,)} | arguments)
@@ -87,4 +82,5 @@ def program(case, how: str, options):
         return jd.rollout(step, control, team, start, None, options.steps)[0]
 
     spread = np.random.default_rng(0).uniform(0.9, 1.1, (options.worlds, 1, 4))
-    return (jd.over_worlds(fly) if how == "over_worlds" else jax.jit(jax.vmap(fly))), jnp.asarray(mean * spread)
+    many = jd.over_worlds(fly) if how == "over_worlds" else jax.jit(jax.vmap(fly))
+    return functools.partial(many, jnp.asarray(mean * spread))

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 import jaxdrones as jd
-from benchmarks.common import success_rate
+from benchmarks.common import outcome, success_rate
 from benchmarks.rivals import environment
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
@@ -142,8 +142,7 @@ FLOWN = {"own": on_own, "delay": with_delays, "bullet": on_bullet, "crazyflow": 
 def flown(plant: str, run: Run, env: Env, episodes: int) -> dict:
     """How a policy flies many worlds at once."""
     came = evaluate(env, run.policy(env=env), jax.random.key(SEED), episodes)
-    p50, p99 = came.final_error_percentiles[50], came.final_error_percentiles[99]
-    return row(plant, run, episodes, came.success, came.success_interval, p50, p99)
+    return {"plant": plant, "policy": run.folder.name, "episodes": episodes} | outcome(came)
 
 
 def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
@@ -155,14 +154,9 @@ def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
         success += list(whole & env.task.success(flight.metrics, env.dt))
         error += list(flight.metrics["error"][-1])
     n = len(success)
-    interval = wilson_interval(int(sum(success)), n)
-    p50, p99 = (float(np.percentile(error, q)) for q in (50, 99))
-    return row(plant, run, n, float(np.mean(success)), interval, p50, p99)
-
-
-def row(plant, run, episodes, success, interval, p50, p99) -> dict:
-    found = {"success": success, "interval": interval, "error p50": p50, "error p99": p99}
-    return {"plant": plant, "policy": run.folder.name, "episodes": episodes} | found
+    found = {"success": float(np.mean(success)), "interval": wilson_interval(int(sum(success)), n)}
+    found |= {f"error p{q}": float(np.percentile(error, q)) for q in (50, 99)}
+    return {"plant": plant, "policy": run.folder.name, "episodes": n} | found
 
 
 def with_physics(env: Env, step) -> Env:

@@ -54,7 +54,7 @@ def calibrated(airframe: str, trained: jd.Params) -> jd.Params:
     """
     found = load_params(Dynamics.first_principles, airframe)
     mass = jnp.asarray(found["mass"], float)
-    hover_rpm = jnp.asarray(_speed_of(mass * 9.81 / 4, found["rpm2thrust"]), float)
+    hover_rpm = jnp.asarray(speed_of(mass * 9.81 / 4, found["rpm2thrust"]), float)
     return trained.replace(
         mass=mass,
         kf=mass * trained.gravity / (4 * hover_rpm**2),
@@ -105,7 +105,7 @@ def told(theirs, params: jd.Params):
     )
 
 
-def _speed_of(thrust: float, curve) -> float:
-    """Rotor speed, RPM, at which the curve a + b w + c w^2 gives a thrust (N)."""
+def speed_of(thrust, curve):
+    """Rotor speed, RPM, at which the curve a + b w + c w^2 gives a thrust (N), any shape."""
     a, b, c = curve
     return (-b + (b**2 - 4 * c * (a - thrust)) ** 0.5) / (2 * c)

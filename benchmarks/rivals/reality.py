@@ -21,7 +21,7 @@ from rotorpy.vehicles import crazyflie_params, crazyfliebrushless_params
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
 
 import jaxdrones as jd
-from benchmarks.rivals.crazyflow import make_sim, make_step
+from benchmarks.rivals.crazyflow import make_sim, make_step, speed_of
 from benchmarks.rivals.rotorpy import RADIANS_PER_SECOND
 from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import HORIZONS, FlightLog, errors_as_dict, load_flights
@@ -62,10 +62,6 @@ def plants(log: FlightLog) -> dict[str, Plant]:
 def crazyflow(airframe: str) -> Plant:
     """Its first-principles plant by its default integrator."""
     own = load_params(Dynamics.first_principles, airframe)
-    c, b, a = own["rpm2thrust"]
-
-    def speed(thrust):
-        return (-b + np.sqrt(b**2 - 4 * a * (c - thrust))) / (2 * a)
 
     def fly(log: FlightLog, starts: np.ndarray) -> jd.State:
         sim = make_sim(airframe, round(SUBSTEPS / PERIOD))
@@ -74,7 +70,7 @@ def crazyflow(airframe: str) -> Plant:
             coefficients = jnp.broadcast_to(at_once, sim.data.params.rotor_dyn_coef.shape)
             sim.data = sim.data.replace(params=sim.data.params.replace(rotor_dyn_coef=coefficients))
         step = jax.vmap(make_step(sim, 1), (None, 0, 0))
-        speeds = log.rpm[:, 0] if log.has("rpm") else speed(thrusts(log))
+        speeds = log.rpm[:, 0] if log.has("rpm") else speed_of(thrusts(log), own["rpm2thrust"])
 
         def advance(states, rpm):
             for j in range(SUBSTEPS):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
+from benchmarks.rivals.ours import angle
 from jaxdrones import rotation
 
 RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM
@@ -84,9 +85,7 @@ def differences(ours: jd.State, theirs: dict[str, np.ndarray]) -> dict[str, floa
         name: float(np.max(np.linalg.norm(np.asarray(getattr(ours, name)) - theirs[name], axis=-1)))
         for name in ("pos", "vel", "omega")
     }
-    a, b = np.asarray(ours.quat), theirs["quat"]
-    apart = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
-    return found | {"angle": float(np.max(4 * np.arcsin(np.minimum(apart / 2, 1))))}
+    return found | {"angle": angle(ours.quat, theirs["quat"])}
 
 
 def attribution(

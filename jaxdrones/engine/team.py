@@ -78,11 +78,6 @@ class Layout(NamedTuple):
         leaves, structure = jax.tree.flatten(tree)
         return cls(structure, tuple(jnp.shape(leaf)[1:] for leaf in leaves))
 
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return sum(map(math.prod, self.shapes))
-
     def unpack(self, flat: Any, start: int = 0) -> Any:
         """Pytree of the columns of an array (n, k) of JAX or NumPy from `start` on; the inverse of `pack`."""
         leaves = []

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,8 +16,8 @@ from jaxdrones.errors import UserError
 from jaxdrones.flights import parameters
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, normal_equations, standard_errors
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.flights.open_loop import HORIZONS, Windows, cut_windows, hold_errors, open_loop_errors, window_starts
-from jaxdrones.flights.path_fit import fit_path
+from jaxdrones.flights.open_loop import HORIZONS, cut_windows, hold_errors, open_loop_errors, window_starts
+from jaxdrones.flights.path_fit import fit_path, padded
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
@@ -151,7 +150,7 @@ class _Problem:
         self.names, self.flights = self.shared + self.per_flight, [log.name for log in logs]
         starts = [window_starts(log, _STRIDE) for log in logs]
         longest = max(map(len, starts))
-        self.windows = [_padded(cut_windows(log, s), longest) for log, s in zip(logs, starts, strict=True)]
+        self.windows = [padded(cut_windows(log, s), longest) for log, s in zip(logs, starts, strict=True)]
         self.masks = [jnp.asarray(np.arange(longest) < len(s), float) for s in starts]
         self.size = len(self.shared) + len(logs) * len(self.per_flight)
         names = self.shared + self.per_flight * len(logs)
@@ -243,8 +242,3 @@ class _Problem:
             values[flight] = {name: parameters.value_of(flown, name) for name in self.per_flight}
         open_loop = {log.name: open_loop_errors(log, vehicle, self.motors) for log in (*self.logs, *validate)}
         return Report(vehicle, estimates, values, losses, open_loop)
-
-
-def _padded(windows: Windows, count: int) -> Windows:
-    """Windows, padded with the last one to a common count, to share compiled programs between flights."""
-    return jax.tree.map(lambda x: jnp.pad(x, [(0, count - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge"), windows)

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +92,11 @@ def _balance_residuals(
     return (lift / (vehicle.params.mass * (vehicle.params.gravity + acc)) - 1) / _FORCE_STD
 
 
+def padded(tree: Any, count: int) -> Any:
+    """Arrays (k, ...), padded with their last row to a common count, to share compiled programs between flights."""
+    return jax.tree.map(lambda x: jnp.pad(x, [(0, count - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge"), tree)
+
+
 def _path_data(logs: Sequence[FlightLog]) -> tuple[closed_loop.ClosedLoopInputs, Array, Array]:
     """Inputs of equal length, the recorded horizontal paths (flights, points, 2), m, and a mask (flights, points).
 
@@ -104,12 +110,7 @@ def _path_data(logs: Sequence[FlightLog]) -> tuple[closed_loop.ClosedLoopInputs,
         recorded[i, air.start - begin : air.stop - begin] = log.pos[air, 0, :2]
         mask[i, air.start - begin : air.stop - begin] = 1
 
-    def padded(x: Array) -> Array:
-        return jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge")
-
-    equal = [
-        each._replace(setpoint=jax.tree.map(padded, each.setpoint), battery=padded(each.battery)) for each in inputs
-    ]
+    equal = [each._replace(setpoint=padded(each.setpoint, rows), battery=padded(each.battery, rows)) for each in inputs]
     points = slice(None, None, _STRIDE)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *equal)
     return stacked, jnp.asarray(recorded[:, points], float), jnp.asarray(mask[:, points], float)

@@ -73,9 +73,9 @@ def definitions(log: FlightLog, after: float) -> str:
     )
 
 
-def divergence(log: FlightLog, other: FlightLog, rows: int = 12) -> list[dict[str, float]]:
-    """Largest differences over the drones of two flights of the same conditions, at `rows` times."""
-    at = np.unique(np.linspace(0, len(log.t) - 1, rows).round().astype(int))
+def divergence(log: FlightLog, other: FlightLog) -> list[dict[str, float]]:
+    """Largest differences over the drones of two flights of the same conditions, at twelve times."""
+    at = np.unique(np.linspace(0, len(log.t) - 1, 12).round().astype(int))
 
     def largest(difference: np.ndarray) -> list[float]:
         return np.linalg.norm(difference[at], axis=-1).max(axis=-1).tolist()

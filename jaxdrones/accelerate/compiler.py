@@ -67,11 +67,8 @@ def training_options(large_arrays: bool) -> dict[str, Any]:
     """Options for short compilation and execution of trainings on a CPU; empty on other devices.
 
     LLVM's optimizations beyond the first level gain nothing. The older code generator of XLA compiles in two thirds of
-    the time. Its elementwise code is up to ten times slower, which shows in the epochs of PPO on large batches and in
-    images, and not in a program that differentiates the physics and is dominated by its many small arrays.
-
-    Args:
-        large_arrays: whether the program computes large batches or images.
+    the time. Its elementwise code is up to ten times slower, which shows in `large_arrays`, the epochs of PPO on large
+    batches and images, and not in a program that differentiates the physics and is dominated by its many small arrays.
     """
     older = {} if large_arrays else {"xla_cpu_use_fusion_emitters": False}
     return _known(xla_backend_optimization_level=1, **older)

@@ -20,14 +20,10 @@ _REORDERING = frozenset("dynamic_slice gather pad rev slice".split())
 def store_reordered(
     program: Any, consts: Sequence[Array], *inputs: Array, rules: Mapping[str, Callable] | None = None
 ) -> list[Array]:
-    """Evaluate a program for one world, and store its reordered arrays if they are many.
+    """Evaluate a traced program for one world, and store its reordered arrays if they are many.
 
-    Args:
-        program: the traced program.
-        consts: its closed-over values.
-        *inputs: its inputs.
-        rules: evaluation of some primitives, `(equation, *inputs) -> results`. With rules, derivatives are no longer
-            those of the program.
+    `consts` are its closed-over values, `rules` the evaluation of some primitives, `(equation, *inputs) -> results`.
+    With rules, derivatives are no longer those of the program.
     """
     reordered = _reordered(program)
     values = dict(zip(program.constvars, consts, strict=True)) | dict(zip(program.invars, inputs, strict=True))

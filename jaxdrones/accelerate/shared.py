@@ -22,13 +22,10 @@ _COSTS = {"div": 4, "sqrt": 4, "broadcast_in_dim": 0, "convert_element_type": 0}
 
 
 def materialize_shared(function: Callable) -> Callable:
-    """Store the common subexpressions of a function and the derivatives of its arguments, on a CPU.
+    """Store the common subexpressions of a function of pytrees and the derivatives of its arguments, on a CPU.
 
-    It works under `jit`, `vmap` and `grad`. On other devices and unsupported versions of JAX, the function is
-    unchanged.
-
-    Args:
-        function: traceable function of pytrees of arrays. Closed-over values are not stored.
+    It works under `jit`, `vmap` and `grad`; closed-over values are not stored. On other devices and unsupported
+    versions of JAX, the function is unchanged.
     """
 
     def materialized(*arguments):

@@ -13,12 +13,8 @@ from jaxdrones.accelerate.fitting import can_be_a_kernel
 def jit_small(function: Callable, static: int = 0) -> Callable:
     """Compile a function, like `jax.jit`; to a single kernel on a CPU, if its primitives allow it.
 
-    XLA hands each of its usual kernels to a thread, which takes longer than the arithmetic of few numbers. The result
-    cannot be called inside another traced function.
-
-    Args:
-        function: function to compile.
-        static: number of its first arguments that are static.
+    XLA hands each of its usual kernels to a thread, which takes longer than the arithmetic of few numbers. The first
+    `static` arguments are static. The result cannot be called inside another traced function.
     """
     programs = [jax.jit(function, static_argnums=tuple(range(static)))]
     if compiler.AVAILABLE and jax.default_backend() == "cpu":

@@ -34,12 +34,7 @@ _RULES = dict.fromkeys(REDUCTIONS, reduced) | dict.fromkeys(PRODUCTS, product)
 
 
 def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
-    """Evaluate a program that `fits_a_kernel` for many worlds, with worlds as the last axis.
-
-    Args:
-        program: the traced program of one world.
-        consts: its closed-over values.
-        leaves: its inputs, (..., worlds).
+    """Evaluate a program of one world that `fits_a_kernel` for many worlds, with inputs (..., worlds).
 
     Raises:
         NoKernelError: the program cannot be a single kernel.

@@ -32,13 +32,8 @@ def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | No
     """Build `(needed, *args, otherwise=None) -> function(*args)`, with `otherwise` or zeros where `needed` () is false.
 
     Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds, or of all worlds / `one_in`.
-    Derivatives are those of the function where it is needed, else those of `otherwise`, and cost as many worlds; in
-    reverse mode the function is recomputed.
-
-    Args:
-        function: pure function of arrays.
-        one_in: number of chunks that hold all worlds.
-        chunk: worlds in a chunk, in place of `one_in`.
+    Derivatives are those of the function of arrays where it is needed, else those of `otherwise`, and cost as many
+    worlds; in reverse mode the function is recomputed.
     """
 
     def where(needed: Array, *args: Any, otherwise: Any = None) -> Any:

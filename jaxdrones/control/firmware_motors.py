@@ -93,15 +93,10 @@ def duty_cycles(
     voltage: Float[Array, ""],
     dt: float,
 ) -> tuple[Float[Array, ""], Float[Array, "4"]]:
-    """Filtered battery voltage, V, and duty cycles from 0 to 65535.
+    """Filtered battery voltage, V, and duty cycles, 0 to 65535, for a thrust of each motor and a torque, 16 bit.
 
-    Args:
-        motor: model of the motors.
-        thrust: thrust of each motor, 16 bit.
-        torque: roll, pitch, yaw, 16 bit, right-handed body axes.
-        battery: voltage, V; None disables battery compensation, so that a duty cycle equals the command.
-        voltage: filtered voltage at the last call, V; zero at the first call.
-        dt: time since the last call, s.
+    The torque has right-handed body axes. Without a `battery` (V), nothing is compensated, so that a duty cycle equals
+    the command. `voltage` is the filtered one at the last call, V, zero at the first, and `dt` the time since then, s.
     """
     commands = mix(thrust, torque)
     if battery is None:

@@ -124,12 +124,8 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
 def stop_at(state: State, normals: Float[Array, "planes 3"], heights: Float[Array, " planes"]) -> State:
     """Project the state of a drone onto the half spaces n . pos >= h: move it back and remove the approach velocity.
 
-    The impact is inelastic and without spin, so it adds no energy; compliant contact does the rest.
-
-    Args:
-        state: of one drone.
-        normals: unit vectors n, world; zero for no plane.
-        heights: h, m.
+    The impact is inelastic and without spin, so it adds no energy; compliant contact does the rest. The `normals` n are
+    unit vectors, world, or zero for no plane; the `heights` are h, m.
     """
     pos, vel = state.pos, state.vel
     for normal, height in zip(normals, heights, strict=True):

@@ -48,12 +48,9 @@ def flow_through(
     """Flow U through a rotor of constant thrust, m/s: (U - w) sqrt(V^2 + U^2) = v_h^2, after Glauert.
 
     For flow from below, U < 0, the square root has V alone: momentum theory has several solutions there, or none
-    (vortex ring state), and this solution is smooth.
-
-    Args:
-        climb: w, speed of the rotor through the air along its axis, m/s; negative in descent.
-        edgewise_squared: V^2, square of its speed in the plane of the disc, (m/s)^2.
-        in_hover: v_h, induced velocity in hover, m/s.
+    (vortex ring state), and this solution is smooth. `climb` is w, the speed of the rotor through the air along its
+    axis, m/s, negative in descent; V is that in the plane of the disc, and `in_hover` v_h the induced velocity in
+    hover, m/s.
     """
     # The solution for V = 0 is exact there and too large elsewhere; as the left side is convex, Newton's steps go down.
     flow = climb / 2 + jnp.sqrt(climb**2 / 4 + in_hover**2 + _STILL)

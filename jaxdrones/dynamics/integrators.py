@@ -68,13 +68,7 @@ def implicit_midpoint(derivative: Derivative, state: State, dt: float) -> State:
 
 
 def models_after(aux: dict[str, Any], rate: dict[str, Any], dt: float) -> dict[str, Any]:
-    """States of models after a semi-implicit Euler step.
-
-    Args:
-        aux: states of the models, by name.
-        rate: their time derivatives.
-        dt: time step, s.
-    """
+    """States of models by name after a semi-implicit Euler step of `dt` (s), from their time derivatives."""
     return _moved(aux, jax.tree.map(lambda x, k: x + dt * k, aux, rate), dt)
 
 

@@ -62,24 +62,13 @@ class NearObstacles:
     """
 
     def __init__(self, contacts: Sequence[Callable], state: State, scene: Scene):
-        """Find the free balls.
-
-        Args:
-            contacts: effects with declared obstacle contact, such as `obstacle_contact`.
-            state: of the team at the start of the control step.
-            scene: obstacles.
-        """
+        """Find the free balls of a team at the start of a control step, for effects with declared obstacle contact."""
         self._contacts, self._scene, self._free = contacts, scene, stored(FreeBalls.about(state, scene))
 
     def step(self, params: Params, before: State, advance: Callable[[Contact], State]) -> State:
-        """Team after a physics step among the obstacles.
+        """Team after a physics step among the obstacles, by `advance(contact)`: that after a step with this contact.
 
         Where no drone leaves its ball in any world, this is the unobstructed step, and so is its derivative.
-
-        Args:
-            params: of a team of n drones.
-            before: the team at the start of the step.
-            advance: contact with obstacles -> the team at the end of the step with this contact.
         """
         unobstructed = advance(_no_contact)
         still = jax.lax.stop_gradient((params, before, unobstructed))
@@ -105,12 +94,8 @@ class NearObstacles:
 
         Compliant contact yields, and depends on the start of a step alone, so the path of every step is swept. The
         stopping planes are constants of the gradient: it is exact for flat obstacles, and neglects the curvature of
-        round obstacles and derivatives with respect to the obstacles' poses.
-
-        Args:
-            params: of a team of n drones.
-            before: the team at the start of the step.
-            after: the team at the end of an unobstructed step.
+        round obstacles and derivatives with respect to the obstacles' poses. `after` is the end of an unobstructed
+        step.
         """
 
         def find(params: Params, before: State, after: State, scene: Scene) -> Planes:

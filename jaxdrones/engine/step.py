@@ -25,13 +25,9 @@ class Step(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """Advance a team of n drones by one control step.
+        """Advance a team of n drones by one control step with commanded rotor speeds (n, 4), RPM.
 
-        Args:
-            params: constants of the team.
-            state: of the team.
-            rpm: (n, 4) commanded rotor speeds, RPM.
-            scene: scene of this call; by default that of `make_step`.
+        `scene` is the scene of this call, by default that of `make_step`.
         """
 
     @abc.abstractmethod

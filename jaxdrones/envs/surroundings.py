@@ -48,10 +48,7 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
 
     A row has the position (m), the velocity (m/s), the position at the closest approach within 1.5 s at constant
     velocities (m), the time until then (s), and the direction, scaled by nearness; relative to the drone, world axes.
-
-    Args:
-        count: number of drones; in smaller teams the remaining rows are beyond `reach`.
-        reach: distance at which a drone is out of sight, m.
+    In teams of no more than `count` drones the remaining rows are beyond `reach` (m), at which a drone is out of sight.
     """
 
     def observe(task: Task, world: World) -> Array:

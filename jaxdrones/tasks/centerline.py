@@ -47,15 +47,10 @@ class Centerline(PyTreeNode):
 
 
 def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], acc: Float[Array, ""]) -> Centerline:
-    """Centerline from the start through gates.
+    """Centerline from the start through gates, with largest acceleration along the curve and across it (m/s^2).
 
     A segment is a cubic curve in the crossing directions of both gates: a quarter turn is nearly an arc, a half turn is
-    flatter.
-
-    Args:
-        gates: x, y, z (m) and heading (rad) of all gates in order.
-        start: x, y, z and heading at the start.
-        acc: largest acceleration along the curve and across it, m/s^2.
+    flatter. The rows of `gates`, in order, and `start` are x, y, z (m) and heading (rad).
     """
     begin, count = jnp.concatenate([start[None], gates[:-1]]), len(gates)
     ways = jnp.stack([direction(begin), direction(gates)], axis=1)

@@ -62,10 +62,7 @@ _ROTORS = tuple(f"rotor{i}" for i in range(4))
 
 
 def load_params(vehicle: str | os.PathLike) -> Params:
-    """Load the constants of one drone.
-
-    Args:
-        vehicle: a bundled vehicle (`jaxdrones.assets.vehicles()` names all) or the path of a URDF.
+    """Load the constants of one drone by the path of a URDF or a name of `jaxdrones.assets.vehicles()`.
 
     Raises:
         ValueError: an unknown vehicle, or a URDF with missing or invalid entries.

@@ -148,9 +148,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every world, or in those of a mask, reproducible by seeds.
 
-        Args:
-            seed: seed of the first world, incremented for the others; or one for every world.
-            options: `None`, or `reset_mask`: (num_envs,) bool, the worlds to reset.
+        A single seed is that of the first world, incremented for the others. The option `reset_mask` (num_envs,) is the
+        mask.
 
         Raises:
             ValueError: a wrong number of seeds, a wrong mask, or an unknown option.

@@ -80,13 +80,10 @@ def _excess(
 
 
 def _inverses(wrenches: Float[Array, "4 4"]) -> list[Float[Array, "8 4"]]:
-    """Rows of the least-squares inverses of A for every set of rotors; they depend only on the vehicle.
+    """Rows of the least-squares inverses of A, the columns of `wrenches`, for every set of rotors.
 
-    A row is the squared speed of one rotor per demand, along the part of its wrench that the others do not produce:
-    the orthogonalization of Gram and Schmidt.
-
-    Args:
-        wrenches: columns of A, the wrench of each rotor.
+    They depend only on the vehicle. A row is the squared speed of one rotor per demand, along the part of its wrench
+    that the others do not produce: the orthogonalization of Gram and Schmidt.
 
     Returns:
         For each rotor its row with every set of the other rotors: the first without any, the last with all of them,

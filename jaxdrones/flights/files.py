@@ -56,11 +56,9 @@ def find_log(path: str | os.PathLike) -> Path:
 def read_log(path: str | os.PathLike) -> FlightLog:
     """Read the log of a flight.
 
-    Arrays are those of `FlightLog` by name; `gyro`, `ref_pos` and `ref_yaw` are aliases of `omega`, `target_pos` and
-    `target_yaw`. The drone axis is optional for a single drone. Other arrays are ignored.
-
-    Args:
-        path: an .npz or .csv file, a ROS 2 bag, a folder of `jaxdrones fly`, or the name of a bundled log.
+    It is an .npz or .csv file, a ROS 2 bag, a folder of `jaxdrones fly`, or the name of a bundled log. Arrays are those
+    of `FlightLog` by name; `gyro`, `ref_pos` and `ref_yaw` are aliases of `omega`, `target_pos` and `target_yaw`. The
+    drone axis is optional for a single drone. Other arrays are ignored.
 
     Raises:
         UserError: no log, or a damaged one: an array is missing, has another shape, is not finite, or time does not

@@ -211,13 +211,11 @@ class Policy(PyTreeNode):
         return hidden_state, jnp.tanh(output)
 
     def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "*batch a"]:
-        """Actions of a sequence of normalized observations.
+        """Actions of a sequence of normalized observations (t, *batch, n, d), or of a dictionary of them.
 
-        Args:
-            hidden_state: (*batch, n, ...) hidden state before the first observation.
-            obs: (t, *batch, n, d) normalized observations, or a dictionary; without a hidden state and `per_agent` with
-                any leading axes.
-            starts: (t, *batch) whether an episode starts with the observation; `None` without a hidden state.
+        The hidden state (*batch, n, ...) is that before the first observation; `starts` (t, *batch) tell whether an
+        episode starts with an observation, and are `None` without a hidden state. Without both and `per_agent` the
+        leading axes are any.
         """
         return jnp.tanh(apply(self.network, self.params, obs, self.per_agent, hidden_state, starts)[1])
 

@@ -105,15 +105,9 @@ class Noise:
 
 
 def allan_deviation(readings: ArrayLike, dt: float, samples: int) -> np.ndarray:
-    """Overlapping Allan deviation of readings, in units of a reading.
+    """Overlapping Allan deviation (...) of readings (n, ...) at rest, `dt` (s) apart, in units of a reading.
 
-    Args:
-        readings: (n, ...) readings at rest; further axes are channels.
-        dt: time between readings, s.
-        samples: number of readings in an average; the averaging time is `samples` times `dt`, s.
-
-    Returns:
-        (...) deviations of the channels.
+    Further axes are channels. The averaging time is the number of `samples` in an average times `dt`.
 
     Raises:
         ValueError: fewer than 2 `samples` + 1 readings.

@@ -234,10 +234,9 @@ class Task:
     def succeeded(self, metrics: Mapping[str, Array], ends: Mapping[str, Array], dt: float) -> Bool[Array, " n"]:
         """Whether a drone, or with `ends="team"` every drone, met the criterion of success without a failure.
 
-        Args:
-            metrics: (T, n) metrics over the longest possible episode, with their last values after its end.
-            ends: (n,) by name, terminations and truncations in the last step of each drone's episode.
-            dt: control period, s.
+        `metrics` (T, n) are those over the longest possible episode, with their last values after its end; `ends` (n,)
+        are, by name, the terminations and truncations in the last step of each drone's episode; `dt` is the control
+        period, s.
         """
         assert self.success is not None, "the task has no criterion of success"
         succeeded = self.success(metrics, dt)

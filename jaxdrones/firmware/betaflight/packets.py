@@ -55,13 +55,9 @@ class Sticks(NamedTuple):
 
 
 def state_packet(t: float, quat: np.ndarray, omega: np.ndarray, specific_force: np.ndarray) -> bytes:
-    """State packet.
+    """State packet of a simulated time (s) and an attitude (4,): x, y, z, w, body to world.
 
-    Args:
-        t: simulated time, s.
-        quat: (4,) x, y, z, w, body to world.
-        omega: (3,) rad/s, body, x forward, y left, z up.
-        specific_force: (3,) m/s^2, body, same axes: 9.8 upwards at rest.
+    The body rates, rad/s, and the specific force, m/s^2, 9.8 upwards at rest, have the axes x forward, y left, z up.
     """
     packet = np.zeros((), STATE)
     packet["t"] = t

@@ -142,8 +142,8 @@ class Node:
         if self._stepper.hear(self._clock()):
             self._warn("the step service is called again; the flight is in lockstep")
         self._step()
-        seconds, ns = divmod(self._flight.ns, 1_000_000_000)
-        return True, f"{seconds}.{ns:09d}"
+        now = convert.stamp(self._flight.ns)
+        return True, f"{now.sec}.{now.nanosec:09d}"
 
     def _await_stepper(self) -> None:
         self._transport.spin(max(self._stepper.remaining(self._clock()), 0))

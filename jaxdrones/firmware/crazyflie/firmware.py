@@ -62,7 +62,7 @@ class Crazyflie:
                 channel, data, self.time, self.status
             ),
             Port.PLATFORM: self._answer_platform,
-            Port.LINK: self._answer_link,
+            Port.LINK: lambda client, channel, data: {0: data, 1: _SOURCE}.get(channel),
         }
 
     @property
@@ -115,9 +115,6 @@ class Crazyflie:
 
     def _set_gains(self, gains) -> None:
         self.vehicle.gains = gains
-
-    def _answer_link(self, client: _Client, channel: int, data: bytes) -> bytes | None:
-        return {0: data, 1: _SOURCE}.get(channel)
 
     def _answer_platform(self, client: _Client, channel: int, data: bytes) -> bytes | None:
         if channel == 1 and data[:1] == b"\0":

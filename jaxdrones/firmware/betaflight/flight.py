@@ -131,14 +131,14 @@ class Flight:
         for _ in range(_FIRST):  # disarms a Betaflight whose simulator was killed, which takes no settings while armed
             self._link.send_sticks(rc_packet(self._simulation.time, Sticks()))
             self._run_for(0.02)
-        now = self._simulation
-        again = settings.configure(client, now.params, 1 / now.dt, reversed_yaw=now.reversed_yaw)
+        plant = self._simulation
+        again = settings.configure(client, plant.params, 1 / plant.dt, reversed_yaw=plant.reversed_yaw)
         if again and self._process is not None:
             self._process.restart()
             return "it is started again with its settings"
         if again:
             self._warn("the joined Betaflight takes the rate of its loop when it is started again; it flies without")
-        first = now.packet()
+        first = plant.packet()
         for _ in range(_FIRST):  # with one time: the pace of Betaflight's clock begins afterwards
             self._link.send_state(first)
             time.sleep(0.001)

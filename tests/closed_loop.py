@@ -8,6 +8,7 @@ import golden_data
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Params, State
@@ -61,7 +62,7 @@ def control_team(control, gains, team: Params, memory: Any, state: State, target
     return jax.vmap(partial(control, dt=dt), (None, 0, 0, 0, 0))(gains, team, memory, state, target)
 
 
-@partial(jax.jit, static_argnames=("control", "control_hz"))
+@partial(jit_unoptimized, static_argnames=("control", "control_hz"))
 def fly(control, gains, team: Params, state: State, memory: Any, targets: Any, *, control_hz: int) -> State:
     """The states after every control step at 240 physics steps per second.
 

@@ -81,7 +81,7 @@ def test_rotor_speeds_are_within_what_the_motors_can_in_any_state(loop):
 @each_controller
 def test_a_compiled_batch_equals_a_loop_over_drones(loop):
     team, memory, state, target = in_flight(loop)
-    batch = call(loop.control, loop.gains(), team, memory, state, target)
+    batch = call_optimized(loop.control, loop.gains(), team, memory, state, target)
     for i in range(3):
         alone = loop.control(loop.gains(), *(one(x, i) for x in (team, memory, state, target)), dt=DT)
         # RPM; the compiler may reorder sums, and a difference over dt multiplies their roundings by 1e7 PWM
@@ -175,7 +175,7 @@ def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     """A quarter of a second from 1 cm off, per relative change of each gain."""
     team = team_of(loop.vehicle)
     start = hovering(team, (0.01, -0.02, 1.01)).replace(vel=jnp.array([[0.02, 0.01, -0.03]]))
-    targets = always(stay(loop, team), 60)
+    targets = jax.tree.map(jnp.asarray, always(stay(loop, team), 60))
     gains, unravel = ravel_pytree(loop.gains())
 
     @jax.jit
@@ -204,8 +204,8 @@ def test_float32_agrees_with_float64(loop):
     situation = jax.tree.map(rounded, in_flight(loop, size=gentle(loop)))
     with jax.enable_x64(True):
         wide = jax.tree.map(lambda x: jnp.asarray(x, float), situation)
-        _, expected = call(loop.control, loop.gains(), *wide)
-    _, rpm = call(loop.control, loop.gains(), *jax.tree.map(jnp.asarray, situation))
+        _, expected = call_optimized(loop.control, loop.gains(), *wide)
+    _, rpm = call_optimized(loop.control, loop.gains(), *jax.tree.map(jnp.asarray, situation))
     assert rpm.dtype == jnp.float32 and expected.dtype == jnp.float64
     rpm, expected = np.asarray(rpm), np.asarray(expected)
     # Thrusts are sums and differences of terms as large as the largest, so it is squares that agree: to a few roundings
@@ -225,9 +225,12 @@ def test_arrays_of_a_team_are_refused(loop):
                 loop.control(loop.gains(), *(one_drone | {name: of_a_team}).values(), dt=DT)
 
 
-@partial(jax.jit, static_argnums=0)
-def call(control, gains, team, memory, state, target):
+def once(control, gains, team, memory, state, target):
     return control_team(control, gains, team, memory, state, target, dt=DT)
+
+
+call = jit_unoptimized(once, static_argnums=0)
+call_optimized = jax.jit(once, static_argnums=0)
 
 
 @partial(jit_unoptimized, static_argnums=0)
@@ -240,6 +243,9 @@ def differentiate(control, inputs, memory):
         return jnp.sum(rpm @ WEIGHTS), rpm
 
     return jax.grad(weighted, has_aux=True)(inputs)
+
+
+to_rpy = jit_unoptimized(jax.vmap(rotation.to_rpy))
 
 
 def stay(loop, team):
@@ -260,7 +266,7 @@ def in_flight(loop, size=1.0):
     wild, calm = flying(team, tilt=0.1 * size), hovering(team)
     state = wild.replace(vel=size * wild.vel, omega=size * wild.omega, pos=calm.pos + size * (wild.pos - calm.pos))
     offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
-    rpy = jax.jit(jax.vmap(rotation.to_rpy))(state.quat)
+    rpy = to_rpy(state.quat)
     if loop in VELOCITY:
         target = jnp.array(size * rng.normal(size=(N, 4)))
     else:
@@ -275,7 +281,7 @@ def in_flight(loop, size=1.0):
     return team, memory, state, target
 
 
-@jax.jit
+@jit_unoptimized
 def turn_world(yaw, state, target, memory):
     turn = rotation.exp(jnp.array([0, 0, yaw]))
     rotate = jax.vmap(partial(rotation.rotate, turn))

@@ -25,7 +25,7 @@ def setpoint(pos=(0.0, 0.0, 1.0), yaw=0.0):
     return Setpoint.at(jnp.array(pos), yaw=jnp.array(yaw))
 
 
-@jax.jit
+@jit_unoptimized
 def commanded(gains, est, ref_pos, ref_yaw, vbat):
     """What is commanded along a log of 100 Hz, from integrators that are empty where it begins."""
 
@@ -106,7 +106,7 @@ def test_the_mixing_of_the_firmware_is_that_of_its_rotors():
 
 def test_the_slow_loops_run_at_every_fifth_call():
     memory, thrust = firmware_pid.init(), []
-    call = jax.jit(partial(firmware_pid.pwm, firmware_pid.gains()))
+    call = jit_unoptimized(partial(firmware_pid.pwm, firmware_pid.gains()))
     for k in range(20):
         memory, command = call(memory, LEVEL.replace(pos=jnp.array([0, 0, 1 - 0.01 * k])), setpoint())
         thrust.append(float(command.thrust))
@@ -126,7 +126,7 @@ def teams():
         return jax.vmap(partial(firmware_pid.control, setpoint=target, dt=DT))(gains, team, memory, state)
 
     memory = for_team(firmware_pid.init(), len(VEHICLES))
-    return jax.jit(lambda: jaxdrones.rollout(step, control, team, hovering(team), memory, 4000)[1])()
+    return jit_unoptimized(lambda: jaxdrones.rollout(step, control, team, hovering(team), memory, 4000)[1])()
 
 
 @pytest.mark.parametrize("i", range(len(VEHICLES)), ids=VEHICLES)
@@ -226,7 +226,7 @@ def test_gradients_of_duty_cycles_agree_with_differences():
     gains, memory = firmware_pid.gains(), firmware_pid.init()
     direction = jnp.array([0.3, -0.5, 0.2])
 
-    @jax.jit
+    @jit_unoptimized
     @jax.value_and_grad
     def first(x):
         state = LEVEL.replace(pos=LEVEL.pos + x * direction, omega=x * direction)

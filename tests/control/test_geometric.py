@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import always, at, control_team, distance, fly, hovering, mirrored, one, reaches, team_of
-from helpers import VEHICLES, flying
+from helpers import VEHICLES, flying, jit_unoptimized
 from scipy.spatial.transform import Rotation
 
 from jaxdrones import rotation
@@ -133,7 +133,7 @@ def vee(skew):
     return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
 
 
-@jax.jit
+@jit_unoptimized
 def call(team, state, setpoint):
     return control_team(geometric.control, geometric.gains(), team, None, state, setpoint, dt=1 / HZ)[1]
 
@@ -164,7 +164,7 @@ def circle():
     n = len(VEHICLES)
     time = jnp.arange(SECONDS * HZ + 1) / HZ
     path = {
-        name: jnp.broadcast_to(jax.jit(jax.vmap(f))(time)[:, None], (len(time), n, 3))
+        name: jnp.broadcast_to(jit_unoptimized(jax.vmap(f))(time)[:, None], (len(time), n, 3))
         for name, f in {"pos": place, "vel": velocity, "acc": acceleration, "omega": turn}.items()
     }
     return path

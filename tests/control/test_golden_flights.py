@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import control_team, recorded_vehicle
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -74,7 +75,7 @@ def team_and_dt(case):
     return jaxdrones.repeat(params, case.about["num_drones"]), 1 / case.about["control_freq_hz"]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit_unoptimized, static_argnums=0)
 def along(control, gains, team, memory, states, targets, dt):
     """The commands (length, n, 4) along recorded states (length, n, 13); the angular velocity there is in the world."""
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import hovering, make_step, one, team_of
-from helpers import VEHICLES
+from helpers import VEHICLES, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -30,7 +30,7 @@ def flight(module, vehicles, target, seconds, **constants):
         return jax.vmap(call)(gains, team, memory, state)
 
     start, memory = hovering(team), for_team(module.init(), n)
-    return jax.jit(lambda: jaxdrones.rollout(step, control, team, start, memory, round(seconds / DT))[1])()
+    return jit_unoptimized(lambda: jaxdrones.rollout(step, control, team, start, memory, round(seconds / DT))[1])()
 
 
 @pytest.fixture(scope="module")

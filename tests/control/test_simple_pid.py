@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import hovering, one, reaches, recorded_vehicle, team_of
+from helpers import jit_unoptimized
 
 from jaxdrones import State
 from jaxdrones.control import for_team, simple_pid
@@ -62,12 +63,12 @@ def fly_30_cm(hz, seconds, **constants):
     return reaches(simple_pid, ("hb",), (0.3, -0.3, 1.3), seconds, hz, memory=memory, **constants)
 
 
-@jax.jit
+@jit_unoptimized
 def call(params, memory, state, setpoint, dt):
     return simple_pid.control(simple_pid.gains(), params, memory, state, setpoint, dt=dt)
 
 
-@jax.jit
+@jit_unoptimized
 @partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
 def call_in_sequence(params, dt, pos, quat, target_pos):
     def advance(memory, row):

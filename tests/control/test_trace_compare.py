@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import recorded_vehicle
+from helpers import jit_unoptimized
 
 from jaxdrones import State, rotation
 from jaxdrones.control import Setpoint, pid
@@ -65,7 +66,7 @@ def test_the_pid_flies_the_trace_as_it_was_flown(name):
     start = arrays["initial_state"][0]
     quat = jnp.array(start[3:7])
     still = Body(jnp.array(start[:3]), quat, jnp.zeros(3), jnp.zeros(3), quat)
-    body, rpm, pos = jax.jit(
+    body, rpm, pos = jit_unoptimized(
         lambda: jax.lax.scan(advance, (still, pid.init(), jnp.zeros(4)), jnp.arange(rows * every))[1]
     )()
     body, rpm, pos = jax.tree.map(lambda x: np.asarray(x)[::every], (body, rpm, pos))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import always, fly, hovering, one, recorded_vehicle, team_of
+from helpers import jit_unoptimized
 
 from jaxdrones import State
 from jaxdrones.control import for_team, pid, velocity
@@ -56,7 +57,7 @@ def test_zero_stops_a_drone_and_keeps_its_heading():
 def test_the_length_of_the_direction_and_the_sign_of_the_share_do_not_matter():
     team = team_of("cf2x")
     state = hovering(team)
-    call = jax.jit(
+    call = jit_unoptimized(
         lambda action: velocity.control(pid.gains(), one(team), pid.init(), one(state), action, dt=jnp.array(1 / 48))[1]
     )
     rpm = call(jnp.array([0.3, -0.4, 0.5, 0.7]))
@@ -64,7 +65,7 @@ def test_the_length_of_the_direction_and_the_sign_of_the_share_do_not_matter():
     assert jnp.max(jnp.abs(call(jnp.array([0.3, -0.4, 0.5, 0.2])) - rpm)) > 1
 
 
-@jax.jit
+@jit_unoptimized
 @partial(jax.vmap, in_axes=(None, None, 0, 0, 0, 0))
 def call_in_sequence(params, dt, pos, quat, vel, action):
     def advance(memory, row):

@@ -58,7 +58,7 @@ def tape(params: Params, length: int, seed: int = 1) -> jax.Array:
     return jnp.array(np.random.default_rng(seed).uniform(0.9, 1.1, shape)) * params.hover_rpm[None, :, None]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit_unoptimized, static_argnums=0)
 def fly(step, params: Params, state: State, rpm: jax.Array) -> State:
     """The states after each row of a tape of rotor speeds."""
     return jaxdrones.rollout(step, lambda params, rpm, state, k: (rpm, rpm[k]), params, state, rpm, len(rpm))[1]

@@ -181,7 +181,7 @@ def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     @jax.jit
     @jax.value_and_grad
     def cost(change):
-        flown = fly(
+        flown = fly.__wrapped__(
             loop.control, unravel(gains * (1 + change)), team, start, for_team(loop.init(), 1), targets, control_hz=240
         )
         off = flown.pos - jnp.array([[[0, 0, 1.0]]])

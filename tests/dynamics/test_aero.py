@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_finite, flying
+from helpers import assert_close, assert_finite, flying, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, drag, drag_world_axes, ground_effect, ground_effect_2021, rotation
@@ -18,12 +18,12 @@ RADIUS = float(params.prop_radius)
 WEIGHT = float(params.weight)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit_unoptimized, static_argnums=0)
 def on_each(effect, states=states, params=params):
     return jax.vmap(effect, (None, 0))(params, states)
 
 
-@jax.jit
+@jit_unoptimized
 def lift(heights):
     """Smooth ground effect in level hover, N."""
     return jax.vmap(lambda h: ground_effect(params, hovering(h)).force[2])(heights)
@@ -168,7 +168,7 @@ def test_a_vehicle_without_a_coefficient_has_no_ground_effect_and_no_drag():
 def test_without_a_coefficient_values_and_gradients_stay_finite_at_any_height(effect, height):
     hummingbird = jaxdrones.load_params("hb")
     state = jax.tree.map(lambda x: x[0], State.at_rest([[0.0, 0, height]])).replace(rpm=jnp.full(4, 4000.0))
-    force, gradient = jax.jit(jax.value_and_grad(lambda p, s: effect(p, s).force[2], argnums=(0, 1)))(
+    force, gradient = jit_unoptimized(jax.value_and_grad(lambda p, s: effect(p, s).force[2], argnums=(0, 1)))(
         hummingbird, state
     )
     assert force == 0

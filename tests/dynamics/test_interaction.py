@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, to_world
+from helpers import assert_close, jit_unoptimized, to_world
 from scipy.spatial.transform import Rotation
 
 import jaxdrones
@@ -29,7 +29,7 @@ def hovering(pos, quat=(0.0, 0, 0, 1), rpm=None):
 lower = hovering((0, 0, 0))
 
 
-@partial(jax.jit, static_argnames="pair")
+@partial(jit_unoptimized, static_argnames="pair")
 def on_lower(upper, lower=lower, params=params, other=params, pair=downwash):
     return pair(params, lower, other, upper)
 
@@ -46,7 +46,7 @@ def test_forces_of_the_paper_are_the_recorded_ones(name):
     first = State(recorded["pos0"], recorded["quat0"], recorded["vel0"], zero, recorded["rpm0"])
     second = State(recorded["pos1"], jnp.tile(jnp.array([[0.0, 0, 0, 1]]), (len(zero), 1)), zero, zero, first.rpm)
     params = golden_data.recorded_params(case)
-    force = jax.jit(jax.vmap(lambda a, b: downwash_2021(params, a, params, b).force))
+    force = jit_unoptimized(jax.vmap(lambda a, b: downwash_2021(params, a, params, b).force))
     for on, expected in (force(first, second), "downwash_on_0"), (force(second, first), "downwash_on_1"):
         np.testing.assert_allclose(on[:, 2], recorded[expected], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(on[:, :2], 0)

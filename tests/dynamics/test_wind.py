@@ -19,7 +19,7 @@ EFFECTS = {"drag": jd.drag, "quadratic drag": jd.quadratic_drag, "inflow": jd.in
 each_effect = pytest.mark.parametrize("name", EFFECTS)
 
 
-@jax.jit
+@jit_unoptimized
 def lift(vel):
     """The change of thrust of a hovering Crazyflie, over its weight, at each of some velocities."""
     states = jax.vmap(lambda vel: HOVER.replace(vel=vel))(vel)
@@ -27,9 +27,9 @@ def lift(vel):
 
 
 def test_drag_of_the_body_takes_power_and_grows_with_the_square_of_the_speed():
-    drag = jax.jit(jax.vmap(jd.quadratic_drag, (None, 0)))
+    drag = jit_unoptimized(jax.vmap(jd.quadratic_drag, (None, 0)))
     wrench, twice = drag(CF2X, STATES), drag(CF2X, STATES.replace(vel=2 * STATES.vel))
-    force = jax.jit(jax.vmap(jd.rotation.rotate))(STATES.quat, wrench.force)
+    force = jit_unoptimized(jax.vmap(jd.rotation.rotate))(STATES.quat, wrench.force)
     assert np.all(np.sum(force * STATES.vel, axis=1) < 0)
     np.testing.assert_allclose(twice.force, 4 * wrench.force, rtol=1e-12)
     ahead = jd.quadratic_drag(CF2X, HOVER.replace(vel=jnp.array([3.0, 0, 0]))).force
@@ -39,10 +39,10 @@ def test_drag_of_the_body_takes_power_and_grows_with_the_square_of_the_speed():
 @each_effect
 def test_only_the_motion_relative_to_the_air_counts_and_a_uniform_field_is_the_wind_of_the_parameters(name):
     wind = jnp.array([1.0, -2, 0.5])
-    effect = jax.jit(jax.vmap(EFFECTS[name], (None, 0)))
+    effect = jit_unoptimized(jax.vmap(EFFECTS[name], (None, 0)))
     blown = effect(CF2X.replace(wind=wind), STATES.replace(vel=STATES.vel + wind[None]))
     assert_close(blown, effect(CF2X, STATES), 1e-12)
-    in_half = jax.jit(jax.vmap(jd.in_wind(lambda pos: wind / 2, EFFECTS[name]), (None, 0)))
+    in_half = jit_unoptimized(jax.vmap(jd.in_wind(lambda pos: wind / 2, EFFECTS[name]), (None, 0)))
     assert_close(in_half(CF2X.replace(wind=wind / 2), STATES), effect(CF2X.replace(wind=wind), STATES), 1e-12)
 
 
@@ -58,7 +58,7 @@ def test_the_mean_wind_is_logarithmic():
     np.testing.assert_allclose(field(jnp.array([7.0, 8.0, 40 * 0.3048])), [0, 5 * 1.141662, 0], rtol=1e-5, atol=1e-12)
     for height in 0.0, -1.0, 0.0457:
         np.testing.assert_allclose(field(jnp.array([0.0, 0, height])), 0, atol=1e-12)
-    assert_finite(jax.jit(jax.jacrev(field))(jnp.array([0.0, 0, -1])))
+    assert_finite(jit_unoptimized(jax.jacrev(field))(jnp.array([0.0, 0, -1])))
 
 
 @pytest.mark.slow
@@ -90,14 +90,14 @@ def test_forward_flight_lifts_and_its_gain_is_bounded():
 
 def test_the_flow_through_a_rotor_is_that_of_glauert_and_of_momentum_theory():
     climb, edgewise = jnp.meshgrid(jnp.array([-1.0, 0, 2, 8]), jnp.array([0.0, 1, 3, 10]))
-    flow = jax.jit(jax.vmap(flow_through, (0, 0, None)))(climb.ravel(), edgewise.ravel() ** 2, 4.0)
+    flow = jit_unoptimized(jax.vmap(flow_through, (0, 0, None)))(climb.ravel(), edgewise.ravel() ** 2, 4.0)
     np.testing.assert_allclose((flow - climb.ravel()) * np.sqrt(edgewise.ravel() ** 2 + flow**2), 16, rtol=1e-6)
     np.testing.assert_allclose(flow[:4], climb[0] / 2 + np.sqrt(climb[0] ** 2 / 4 + 16), rtol=1e-6)
 
 
 def test_a_rotor_that_moves_down_faster_than_its_neighbors_lifts_more_so_rolling_is_damped():
     rolling = HOVER.replace(omega=jnp.array([0.05, 0, 0]))
-    torque = jax.jit(jd.inflow_thrust)(CF2X, rolling).torque
+    torque = jit_unoptimized(jd.inflow_thrust)(CF2X, rolling).torque
     climbs = (
         0.05 * CF2X.rotor_pos[:, 1]
     )  # of the rotors; each loses that times inflow_loss of its quarter of the weight

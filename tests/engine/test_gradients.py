@@ -56,7 +56,7 @@ def cost(step):
     weights = {key: rng.normal(size=(2, {"quat": 4, "rpm": 4}.get(key, 3))) / size for key, size in sizes.items()}
 
     def cost(params, start, commands):
-        trajectory = fly(step, params, start, commands)
+        trajectory = fly.__wrapped__(step, params, start, commands)
         return sum(jnp.sum(getattr(trajectory, key)[-1] * jnp.array(weight)) for key, weight in weights.items())
 
     return cost

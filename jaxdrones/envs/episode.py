@@ -33,7 +33,7 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
     return World(
         params=params,
         drones=env.physics.init(params, drones),
-        variables=variables,
+        variables=jax.tree.map(_strongly_typed, variables),
         memory=env.action.team_memory(env.drones),
         actions=jnp.zeros((env.drones, history, env.action_size), drones.pos.dtype),
         step=jnp.zeros((), jnp.int32),
@@ -41,6 +41,11 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
         dt=env.dt,
         scene=scene,
     )
+
+
+def _strongly_typed(x: Any) -> Any:
+    """Array without a weak type, as after an automatic reset, so that all steps are made by one program."""
+    return jnp.asarray(x, jnp.result_type(x)) if jax.typeof(x).weak_type else x
 
 
 def first_world(env: Any, key: jax.Array) -> World:

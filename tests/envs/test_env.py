@@ -65,6 +65,13 @@ def test_starts_are_valid(task):
             assert np.min(np.linalg.norm(pos[:, i] - pos[:, j], axis=-1)) > 2 * radius
 
 
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover",)))
+def test_no_array_of_a_new_world_is_weakly_typed(task):
+    """None is after an automatic reset, so that the first step would need a program of its own."""
+    world = jax.eval_shape(make_env(task).reset, KEY)[1]
+    assert [x for x in jax.tree.leaves(world) if x.weak_type] == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_different_keys_start_differently_or_the_task_has_one_start(task):

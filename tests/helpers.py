@@ -25,6 +25,10 @@ CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !=
 """Names of the arrays of parameters."""
 
 
+SMALL_TRAINING = {"worlds": 4, "horizon": 4, "hidden_sizes": (8,), "duration": 0.2}
+"""Settings of trainings to run quickly; where they are the same, another test finds the programs in the cache."""
+
+
 def jit_unoptimized(function, **arguments):
     """`jax.jit` in a third of the time for large programs that run a few times and whose law is not about compiling."""
     options = training_options(large_arrays=False) | {"xla_backend_optimization_level": 0}

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import SMALL_TRAINING
 
 from jaxdrones.cli import main
 from jaxdrones.cli.policies import team_of_run
@@ -22,7 +23,7 @@ from jaxdrones.training.run import Run, report_as_dict
 
 pytestmark = pytest.mark.float32
 
-SMALL = ["--set", "worlds=4", "--set", "horizon=4", "--set", "hidden_sizes=8,", "--set", "duration=0.2"]
+SMALL = [word for name, value in SMALL_TRAINING.items() for word in ("--set", f"{name}={value}")]
 TRAIN = ["train", "hover", *SMALL, "--budget", "4", "--episodes", "8"]
 HOSTS = ["train", "hover", "--hosts", "2", "--host", "0", "--coordinator"]
 

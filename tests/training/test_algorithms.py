@@ -5,6 +5,7 @@ import inspect
 import typing
 
 import pytest
+from helpers import SMALL_TRAINING
 
 from jaxdrones.cli import main
 from jaxdrones.learning import bptt
@@ -38,10 +39,11 @@ def test_an_unknown_learner_names_the_closest_one():
         learner("pppo")
 
 
+@pytest.mark.float32
 def test_a_training_traces_its_update_once(monkeypatch):
     traced, update = [], bptt.update
     monkeypatch.setattr(bptt, "update", lambda *arguments: traced.append(arguments) or update(*arguments))
-    trainer = Trainer(Recipe.of("hover", "bptt", worlds=4, horizon=2, hidden_sizes=(4,)), episodes=2)
+    trainer = Trainer(Recipe.of("hover", "bptt", **SMALL_TRAINING, updates=4), episodes=8)
     trainer.compile()
     assert len(traced) == 1
 

@@ -8,6 +8,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from helpers import SMALL_TRAINING
 
 from jaxdrones.training import loop, plan
 from jaxdrones.training.recipe import Recipe
@@ -15,8 +16,6 @@ from jaxdrones.training.run import Run
 from jaxdrones.training.trainer import Trainer
 
 pytestmark = pytest.mark.float32
-
-SETTINGS = dict(worlds=4, horizon=4, hidden_sizes=(8,), duration=0.2, updates=6)
 
 
 class Killed(BaseException):
@@ -26,7 +25,7 @@ class Killed(BaseException):
 @pytest.fixture(scope="module")
 def trainer():
     with jax.enable_x64(False):
-        trainer = Trainer(Recipe.of("hover", "bptt", **SETTINGS), 8)
+        trainer = Trainer(Recipe.of("hover", "bptt", **SMALL_TRAINING, updates=6), 8)
         trainer.compile()
     return trainer
 

@@ -27,6 +27,8 @@ CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !=
 
 SMALL_TRAINING = {"worlds": 4, "horizon": 4, "hidden_sizes": (8,), "duration": 0.2}
 """Settings of trainings to run quickly; where they are the same, another test finds the programs in the cache."""
+SMALL_OPTIONS = [word for name, value in SMALL_TRAINING.items() for word in ("--set", f"{name}={value}")]
+"""The same at the command line."""
 
 
 def jit_unoptimized(function, **arguments):

@@ -4,6 +4,7 @@ import json
 
 import jax
 import pytest
+from helpers import SMALL_OPTIONS
 
 from jaxdrones.cli import main
 from jaxdrones.training.recipe import Recipe
@@ -11,8 +12,7 @@ from jaxdrones.training.run import Run
 
 pytestmark = pytest.mark.float32
 
-SMALL = ["--set", "worlds=4", "--set", "horizon=4", "--set", "hidden_sizes=8,", "--set", "duration=0.2"]
-TRAIN = ["train", "hover", *SMALL, "--budget", "1", "--episodes", "4", "--no-figure"]
+TRAIN = ["train", "hover", *SMALL_OPTIONS, "--budget", "1", "--episodes", "4", "--no-figure"]
 
 
 def said(capsys, *command):

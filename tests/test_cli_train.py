@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_TRAINING
+from helpers import SMALL_OPTIONS
 
 from jaxdrones.cli import main
 from jaxdrones.cli.policies import team_of_run
@@ -23,8 +23,7 @@ from jaxdrones.training.run import Run, report_as_dict
 
 pytestmark = pytest.mark.float32
 
-SMALL = [word for name, value in SMALL_TRAINING.items() for word in ("--set", f"{name}={value}")]
-TRAIN = ["train", "hover", *SMALL, "--budget", "4", "--episodes", "8"]
+TRAIN = ["train", "hover", *SMALL_OPTIONS, "--budget", "4", "--episodes", "8"]
 HOSTS = ["train", "hover", "--hosts", "2", "--host", "0", "--coordinator"]
 
 
@@ -251,7 +250,19 @@ def test_gradients_that_are_not_finite_stop_training_though_nothing_else_shows_t
 
 @pytest.mark.slow
 def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
-    arguments = ["train", "hover", *SMALL, "--algo", "shac", "--budget", "0.001s", "--episodes", "8", "--seeds", "2"]
+    arguments = [
+        "train",
+        "hover",
+        *SMALL_OPTIONS,
+        "--algo",
+        "shac",
+        "--budget",
+        "0.001s",
+        "--episodes",
+        "8",
+        "--seeds",
+        "2",
+    ]
     assert main([*arguments, "--seed", "3", "--json", "--output", str(tmp_path)]) == 0
     captured = capsys.readouterr()
     assert "warning: compiling took all of --budget 0.001s; one update is made, --resume continues it" in captured.err

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from documents import ROOT
+from helpers import SMALL_OPTIONS
 from PIL import Image
 
 from jaxdrones.cli import main
@@ -15,7 +16,8 @@ from jaxdrones.training.run import Run
 from jaxdrones.visualization import browser
 from jaxdrones.visualization.viewer.payload import decode
 
-SHORT = "--set worlds=8 --set horizon=4 --budget 4 --episodes 8 --no-figure"
+SHORT = f"{' '.join(SMALL_OPTIONS)} --budget 4 --episodes 8 --no-figure"
+pytestmark = pytest.mark.float32
 EVALUATED = "(s, k) => { s.value = k; s.dispatchEvent(new Event('input')); }"
 
 
@@ -28,7 +30,8 @@ def train(folder, more=""):
 def runs(tmp_path_factory):
     """Run with its history, and the same training without."""
     folder = tmp_path_factory.mktemp("runs")
-    return train(folder / "kept", "--keep-history"), train(folder / "plain")
+    with jax.enable_x64(False):
+        return train(folder / "kept", "--keep-history"), train(folder / "plain")
 
 
 def test_the_policy_of_every_evaluation_is_kept(runs):
@@ -93,9 +96,9 @@ def test_the_page_plays_every_policy_and_can_be_scrubbed_by_update(runs, tmp_pat
         for k in (len(updates) - 1, 1):
             tab.run(f"({EVALUATED})(document.getElementById('update'), {k})")
             assert f"update {updates[k]}:" in tab.run("document.getElementById('title').textContent")
-            shown = tab.run("jaxdrones.positionsAt(0.5)")[k]
+            shown = tab.run("jaxdrones.positionsAt(0.1)")[k]
             world = header["worlds"][k]
-            row = int(np.abs(np.asarray(world["t"]) - 0.5).argmin())
+            row = int(np.abs(np.asarray(world["t"]) - 0.1).argmin())
             np.testing.assert_allclose(shown, world["pos"][row], atol=1e-4)
         tab.run("jaxdrones.player.seek(Infinity); jaxdrones.player.toggle()")
         tab.run("jaxdrones.player.time = jaxdrones.player.end - 0.01")
@@ -109,11 +112,11 @@ def test_the_page_plays_every_policy_and_can_be_scrubbed_by_update(runs, tmp_pat
 def test_a_film_of_a_training_shows_every_policy_in_full(runs, tmp_path):
     run, _ = runs
     film, page = tmp_path / "history.gif", tmp_path / "history.html"
-    small = ["--size", "320x240", "--fps", "2", "--output", str(page)]
+    small = ["--size", "320x240", "--fps", "20", "--output", str(page)]
     assert main(["view", str(run.folder), "--history", "--video", str(film), *small]) == 0
     worlds = decode(re.search(r'id="payload" type="text/plain">(.*?)</script>', page.read_text(), re.S)[1])["worlds"]
     with Image.open(film) as frames:
-        assert frames.n_frames == sum(max(1, round(2 * float(world["t"][-1]))) for world in worlds)
+        assert frames.n_frames == sum(max(1, round(20 * float(world["t"][-1]))) for world in worlds)
 
 
 @pytest.mark.slow

@@ -1,9 +1,12 @@
 """A network of a set sees neither its order nor its size, and one policy flies teams of any size."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones import envs
 from jaxdrones.envs.observations import encounters, neighbors, obstacles
@@ -20,8 +23,8 @@ REACH = 1.2
 
 def encoded(own, rows):
     encoder = SetEncoder((8, 4), REACH)
-    params = encoder.init(KEY, own, rows)
-    return lambda own, rows: np.asarray(encoder.apply(params, own, rows))
+    params, apply = jit_unoptimized(encoder.init)(KEY, own, rows), jit_unoptimized(encoder.apply)
+    return lambda own, rows: np.asarray(apply(params, own, rows))
 
 
 def test_the_features_of_a_set_depend_on_neither_order_nor_far_rows():
@@ -90,12 +93,17 @@ def test_the_statistics_of_a_policy_without_sets_are_kept():
     np.testing.assert_array_equal(policy.with_obs_stats(stats).obs_stats.mean, stats.mean)
 
 
+@functools.lru_cache
+def started(drones):
+    env = envs.make("crowd", drones=drones)
+    return env.task, jit_unoptimized(env.reset)(KEY)[1]
+
+
 def observed(term, pos, vel, scene=None):
-    env = envs.make("crowd", drones=len(pos))
-    _, world = env.reset(KEY)
+    task, world = started(len(pos))
     world = world if scene is None else world.replace(scene=scene)
     world = world.replace(drones=world.drones.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel)))
-    return np.asarray(term.observe(env.task, world))
+    return np.asarray(jit_unoptimized(lambda world: term.observe(task, world))(world))
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
@@ -136,7 +144,7 @@ def test_an_obstacle_is_seen_like_a_drone_that_rests_at_its_nearest_point():
 def test_the_nearest_drones_are_found_in_their_order(n, dtype):
     pos = np.random.default_rng(n).uniform(0, 4, (n, 3)).astype(dtype)
     pos[3] = pos[5]  # two at one place see each other first
-    found = np.asarray(nearest(jnp.asarray(pos), 8))
+    found = np.asarray(jit_unoptimized(nearest, static_argnums=1)(jnp.asarray(pos), 8))
     away = np.linalg.norm(pos[None] - pos[:, None], axis=-1)
     assert found[3, 0] == 5 and found[5, 0] == 3 and np.all(found != np.arange(n)[:, None])
     assert all(len(set(row)) == 8 for row in found.tolist())

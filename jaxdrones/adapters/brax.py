@@ -162,9 +162,13 @@ def wrap_for_training(
     """`wrap_env_fn` of the trainers: many worlds, each episode from a new random start.
 
     Brax's own wrapper starts every episode of a world from the same cached state. `info["truncation"]` and
-    `info["time_out"]` are 1 where an episode was truncated, by `episode_length` (control steps) or by the task. Only
-    the defaults of `action_repeat` and `randomization_fn` are supported: use a lower `control_hz` and `randomize` of
-    the environment instead.
+    `info["time_out"]` are 1 where an episode was truncated, by `episode_length` or by the task.
+
+    Args:
+        env: environment of `wrap`.
+        episode_length: control steps of an episode.
+        action_repeat: must be 1; use a lower `control_hz` of the environment instead.
+        randomization_fn: must be `None`; use `randomize` of the environment instead.
 
     Raises:
         ValueError: an unsupported argument.

@@ -123,13 +123,21 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         render_mode: pictures.RenderMode = None,
         **options: Any,
     ):
-        """Wrap an environment; arguments that are not described here are those of `GymnasiumEnv`.
+        """Wrap an environment.
 
-        With `numpy` results are new NumPy arrays; else JAX arrays, without copies and asynchronous, with `final_obs`
-        and `final_info` in every step. `max_episode_steps` is a time limit in steps, in place of the task's duration.
-        The autoreset mode is one of gymnasium or its value: `SAME_STEP`, reset in the step that ends an episode;
-        `NEXT_STEP`, in the step after it, with its action ignored and zero reward; `DISABLED`, only by
-        `reset(options={"reset_mask": ...})`.
+        Args:
+            task: a name, a task, or an environment.
+            num_envs: number of worlds.
+            dict_spaces: as for `GymnasiumEnv`.
+            team_reward: as for `GymnasiumEnv`.
+            numpy: whether to return new NumPy arrays; else JAX arrays, without copies and asynchronous, with
+                `final_obs` and `final_info` in every step.
+            max_episode_steps: time limit in steps, in place of the task's duration.
+            autoreset_mode: a mode of gymnasium or its value: `SAME_STEP`, reset in the step that ends an episode;
+                `NEXT_STEP`, in the step after it, with its action ignored and zero reward; `DISABLED`, only by
+                `reset(options={"reset_mask": ...})`.
+            render_mode: `rgb_array` or `None`.
+            **options: options of `jaxdrones.make`.
         """
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:
@@ -148,8 +156,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every world, or in those of a mask, reproducible by seeds.
 
-        A single seed is that of the first world, incremented for the others. The option `reset_mask` (num_envs,) is the
-        mask.
+        Args:
+            seed: seed of the first world, incremented for the others; or one for every world.
+            options: `None`, or `reset_mask`: (num_envs,) bool, the worlds to reset.
 
         Raises:
             ValueError: a wrong number of seeds, a wrong mask, or an unknown option.

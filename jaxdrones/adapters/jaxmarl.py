@@ -92,11 +92,17 @@ class JaxMARLEnv:
     def step(
         self, key: jax.Array, state: Episode, actions: Mapping[str, Array], reset_state: Episode | None = None
     ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
-        """One control step; the next episode begins with `reset_state`, by default a random one.
+        """One control step.
+
+        Args:
+            key: random key.
+            state: from `reset` or `step`.
+            actions: one for every agent.
+            reset_state: initial state of the next episode; by default a random one.
 
         Returns:
-            Observations and state, those of the next episode after an end; rewards; dones, by agent and `__all__`;
-            and infos with one entry per agent: `rewards` and `metrics` by name, `terminated` and `truncated`.
+            Observations and state, those of the next episode after an end; rewards; dones, by agent and `__all__`; and
+            infos with one entry per agent: `rewards` and `metrics` by name, `terminated` and `truncated`.
         """
         if reset_state is None:
             outcome = self._episodes.step(key, state, self._gathered(actions))

@@ -34,9 +34,14 @@ class VecEnv(vec_env.VecEnv):
         render_mode: str | None = None,
         **options: Any,
     ):
-        """Create the worlds; options are those of `jaxdrones.make`, and `team_reward` as for `GymnasiumEnv`.
+        """Create the worlds.
 
-        `seed` is that of the first reset; SB3's algorithms set it too.
+        Args:
+            task: a name, a task, or an environment.
+            num_envs: number of worlds.
+            seed: seed of the first reset; SB3's algorithms set it too.
+            render_mode: `rgb_array` or `None`.
+            **options: options of `jaxdrones.make`, and `team_reward`, `sum` or `mean` of the rewards of the drones.
         """
         self.envs = gymnasium.VectorEnv(task, num_envs, render_mode=render_mode, **options)
         self.render_mode = render_mode

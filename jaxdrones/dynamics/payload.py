@@ -107,9 +107,12 @@ def with_payload(
 def payload(shared: Switch = False) -> Model:
     """Model of loads on cables; `state.aux["payload"]` is their `PointMass`, the effect `cable` pulls the drones.
 
-    A load is not stopped by the ground, by obstacles or by drones, and has no drag. It starts at rest below its drone.
-    A load that is `shared`, one that hangs from all drones of a team, starts below its middle, about as far as the
-    cables reach; its position and velocity are the same in the row of every drone.
+    A load is not stopped by the ground, by obstacles or by drones, and has no drag. It starts at rest below its drone;
+    a shared load starts below the middle of its team, about as far as the cables reach.
+
+    Args:
+        shared: whether one load hangs from all drones of a team. Its position and velocity are then the same in the row
+            of every drone. By default every drone has a load of its own.
     """
     if shared:
         return Model("payload", _hanging_from_team, _shared_rate, of_team=True)

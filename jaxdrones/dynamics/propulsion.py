@@ -52,9 +52,11 @@ _CUBIC = shape(
 
 @checked
 def cubic_motors(coefficients: Annotated[ArrayLike, _CUBIC], supply: Supply = 3.7) -> Motors:
-    """Motors with a thrust curve of (4,) coefficients of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
+    """Motors with a cubic thrust curve.
 
-    `supply` is the supply voltage without a simulated battery, V.
+    Args:
+        coefficients: (4,) coefficients of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
+        supply: supply voltage without a simulated battery, V.
 
     Raises:
         ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply

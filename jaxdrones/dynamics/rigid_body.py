@@ -24,6 +24,9 @@ def quat_rate(state: State) -> Float[Array, "4"]:
 def specific_force(params: Params, state: State, acc: Float[Array, "3"]) -> Float[Array, "3"]:
     """Specific force R^T (a - g) at the center of mass, m/s^2, body: the reading of an ideal accelerometer.
 
-    `acc` is the acceleration of the center of mass, m/s^2, world: `vel` of the state's derivative.
+    Args:
+        params: of the drone.
+        state: of the drone.
+        acc: (3,) acceleration of the center of mass, m/s^2, world: `vel` of the state's derivative.
     """
     return rotation.rotate_inverse(state.quat, acc + vector.along_z(params.gravity))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.vector import components, dot
+from jaxdrones.vector import along_z, components, dot, total
 
 
 class Wrench(PyTreeNode):
@@ -31,10 +31,10 @@ class Wrench(PyTreeNode):
         return cls(jnp.zeros_like(torque), torque)
 
     @classmethod
-    def of_thrusts(cls, rotor_pos: Float[Array, "4 3"], thrust: Float[Array, "4"]) -> Wrench:
-        """Wrench of forces along body z (N) at the rotors (m, body)."""
+    def of_thrusts(cls, rotor_pos: Float[Array, "4 3"], thrust: Float[Array, "4"] | list[Float[Array, ""]]) -> Wrench:
+        """Wrench of forces along body z (N) at the rotors (m, body); `thrust` is an array or a list of four."""
         x, y, _ = components(rotor_pos.T)
-        zero = jnp.zeros((), thrust.dtype)
-        force = jnp.stack([zero, zero, sum(components(thrust))])
+        force = along_z(total(thrust))
+        zero = jnp.zeros_like(dot(x, thrust))
         torque = jnp.stack([dot(y, thrust), -dot(x, thrust), zero])
         return cls(force, torque)

@@ -35,18 +35,19 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     (Bauersfeld et al. 2024); nearer it is an assumption.
     """
     per_length = 1 / (jnp.sqrt(2.0) * other.arm)
-    axis = rotation.z_axis(other_state.quat)
-    to_other = other_state.pos - state.pos
+    own_axes = rotation.axes(state.quat)
+    axis = [vector.dot(own, rotation.z_axis(other_state.quat)) for own in own_axes]
+    to_other = [vector.dot(own, other_state.pos - state.pos) for own in own_axes]
     speed = vector.total(induced_speed(other, jnp.abs(other_state.rpm))) / 4
-    loss = params.inflow_loss * vector.dot(axis, rotation.z_axis(state.quat))
+    loss = params.inflow_loss * axis[2] * speed
 
     def share(rotor: Float[Array, "3"]) -> Float[Array, ""]:
-        above = (to_other - rotation.rotate(state.quat, rotor)) * per_length
+        above = [(a - b) * per_length for a, b in zip(to_other, vector.components(rotor), strict=True)]
         z = vector.dot(axis, above)
-        return lost_share(loss * speed * _jet(z, vector.dot(above, above) - z**2))
+        return lost_share(loss * _jet(z, vector.dot(above, above) - z**2))
 
-    shares = jnp.stack([share(rotor) for rotor in vector.components(params.rotor_pos)])
-    return Wrench.of_thrusts(params.rotor_pos, -thrust(params, state) * shares)
+    rotors = zip(vector.components(params.rotor_pos), vector.components(thrust(params, state)), strict=True)
+    return Wrench.of_thrusts(params.rotor_pos, [-force * share(rotor) for rotor, force in rotors])
 
 
 @jax.custom_jvp

@@ -64,8 +64,8 @@ def lost_share(loss: Float[Array, "*n"]) -> Float[Array, "*n"]:
     Up to one half it is linear. Beyond, where blades stall, it tends smoothly to one: thrust stays positive and at most
     doubles. The form of this limit is an assumption.
     """
-    beyond = jnp.exp(-jnp.maximum(-2 * loss - 1, 0)) - jnp.exp(-jnp.maximum(2 * loss - 1, 0))
-    return jnp.clip(loss, -0.5, 0.5) + beyond / 2
+    beyond = 1 - jnp.exp(-jnp.maximum(2 * jnp.abs(loss) - 1, 0))
+    return jnp.clip(loss, -0.5, 0.5) + jnp.sign(loss) * beyond / 2
 
 
 def rotor_wrench(params: Params, state: State) -> Wrench:

@@ -64,15 +64,15 @@ class Params(PyTreeNode):
     trim_torque: Array
     """(3,) constant torque of an unbalanced vehicle, N m, body."""
     ground_effect_coeff: Array
-    """() k_G of equation 5 of the paper."""
+    """() k_G of equation 5 of Panerati et al. 2021."""
     downwash_coeff: Array
-    """(3,) k_D1 (N), k_D2, k_D3 (m) of equation 6 of the paper."""
+    """(3,) k_D1 (N), k_D2, k_D3 (m) of equation 6 of Panerati et al. 2021."""
     inflow_loss: Array
     """() share of a rotor's thrust lost per m/s of downwash through it, s/m; below one half of the thrust."""
     prop_radius: Array
-    """() m."""
+    """() radius of the propellers, m."""
     max_speed: Array
-    """() m/s."""
+    """() highest speed of the vehicle, m/s."""
     collision_radius: Array
     """() radius of the collision cylinder, m."""
     collision_height: Array

@@ -50,7 +50,7 @@ class NoKernelError(Exception):
 def fits_a_kernel(program: Any) -> bool:
     """Whether a program of many worlds can and should be a single kernel.
 
-    It should if it has a loop, with otherwise many kernels per iteration.
+    It should if it has a loop, which would otherwise run many kernels per iteration.
     """
     return _has_loop(program) and can_be_a_kernel(program)
 

@@ -215,7 +215,7 @@ def _is_able() -> bool:
 @functools.cache
 def _warn_of_version(why: str) -> None:
     warnings.warn(
-        f"jaxdrones.over_worlds is jax.vmap here: JAX {jax.__version__} {why} that it knows",
+        f"jaxdrones.over_worlds uses jax.vmap: JAX {jax.__version__} {why} of the supported versions",
         RuntimeWarning,
         stacklevel=5,
     )

@@ -30,7 +30,7 @@ WORLD_STATE = "world_state"
 
 
 class JaxMARLEnv:
-    """One world with automatic reset in the same step; episodes begin and end for all agents at once."""
+    """One world with automatic reset in the same step; see `Task.ends` for the ends of episodes."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class JaxMARLEnv:
     def step_env(
         self, key: jax.Array, state: Episode, actions: Mapping[str, Array]
     ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
-        """One control step without reset; returns are those of `step`."""
+        """One control step without reset; the results are those of `step`."""
         outcome = self._episodes.step_without_reset(key, state, self._gathered(actions))
         return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
 

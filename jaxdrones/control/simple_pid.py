@@ -70,8 +70,8 @@ def control(
     """Rotor speeds of one drone, RPM, up to `max_rpm` (unlimited in gym-pybullet-drones).
 
     The controller keeps yaw at zero: it uses only `pos` of the setpoint. Derivatives are differences of errors, so the
-    first call has a spike. With the inertia of the Hummingbird it needs 60 calls per second; the paper uses 48 calls
-    with five times this inertia.
+    first call has a spike. With the inertia of the Hummingbird it needs 60 calls per second
+    (gym-pybullet-drones has 48 calls and five times this inertia).
 
     See `jaxdrones.control`.
     """

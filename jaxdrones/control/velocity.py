@@ -1,4 +1,4 @@
-"""Velocity input of the paper (equation 8): direction and fraction of a speed limit, tracked by the PID."""
+"""Velocity input of gym-pybullet-drones (2021): direction and fraction of a speed limit, tracked by the PID."""
 
 from typing import Annotated
 

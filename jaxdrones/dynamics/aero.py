@@ -1,4 +1,4 @@
-"""Drag (paper, equation 4), ground effect (equation 5) and external forces on one drone.
+"""Drag, ground effect and external forces on one drone; equation numbers are those of Panerati et al. 2021.
 
 `drag` and `ground_effect` are the smooth, physical laws. `drag_world_axes` and `ground_effect_2021` are those of
 gym-pybullet-drones (2021), for its figures and its recorded data.

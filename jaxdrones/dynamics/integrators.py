@@ -29,7 +29,7 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     """Semi-implicit Euler, order 1: velocities first, then poses with the new velocities.
 
     The attitude is rotated by the exponential map. The order of operations is that of gym-pybullet-drones. The explicit
-    gyroscopic term gains energy in a tumble: see the table in the README before using it above a few rad/s.
+    gyroscopic term gains energy in a tumble (docs/physics.md), so use another integrator above a few rad/s.
     """
     state = _normalized(state)  # the exponential map keeps the length only up to rounding
     after = _add(state, dt, derivative(state))

@@ -1,4 +1,4 @@
-"""Downwash of one drone on another (paper, equation 6)."""
+"""Downwash of one drone on another; equation numbers are those of Panerati et al. 2021."""
 
 import math
 

@@ -10,7 +10,10 @@ from jaxdrones.wrench import Wrench
 
 
 def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear acceleration (m/s^2, world) and angular acceleration (rad/s^2, body); paper, equations 2 and 3."""
+    """Linear acceleration (m/s^2, world) and angular acceleration (rad/s^2, body).
+
+    Equations 2 and 3 of Panerati et al. 2021.
+    """
     acc = rotation.rotate(state.quat, wrench.force) / params.mass - vector.along_z(params.gravity)
     gyroscopic = vector.cross(state.omega, params.inertia * state.omega)
     return acc, (wrench.torque - gyroscopic) / params.inertia

@@ -1,4 +1,4 @@
-"""Rotor speeds and rotor wrenches (paper, equations 1 to 3)."""
+"""Rotor speeds and rotor wrenches (Panerati et al. 2021, equations 1 to 3)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -23,7 +23,7 @@ def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
 def instant_rotors(
     params: Params, state: State, command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Rotors without lag (paper). Returns their speed and its rate, RPM and RPM/s."""
+    """Rotors without lag. Returns their speed and its rate, RPM and RPM/s."""
     return limited(params, command), jnp.zeros_like(command)
 
 

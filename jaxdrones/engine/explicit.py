@@ -107,7 +107,7 @@ def make_step(
             named `scene` receives the scene, as in `obstacle_contact` and `ground_contact`.
         pairs: wrenches on a drone by another one, `(params, state, other, other_state) -> Wrench`, such as `downwash`.
         rotors: `instant_rotors`, `lagging_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
-        integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
+        integrator: `semi_implicit_euler`, `euler`, `midpoint`, `implicit_midpoint` or `rk4`.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
         team_effects: wrenches on all drones of the team, `(params, state) -> Wrench` with force and torque (n, 3), such

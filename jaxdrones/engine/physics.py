@@ -63,14 +63,14 @@ def check_function_of_step(name: str, function: Any) -> None:
     check_function(name, given, _ARGUMENTS[name], example=_EXAMPLE[name], hint=_ELSEWHERE.get(name, ""))
     if needs_of(function).contact == "obstacles" and not takes(function, "scene"):
         raise UserError(
-            f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
-            "effect without it"
+            f"{name}: {describe([function])} has a bound scene; give that to make_step(scene=...), and the effect "
+            "without it"
         )
     if contact := _undeclared_contact(function):
         called, wrapped = describe([function]), describe([contact])
         raise UserError(
-            f"{name}: {called} calls {wrapped} and does not declare it, so fast drones and long steps would pass "
-            f"unseen; give functools.wraps({wrapped})({called})"
+            f"{name}: {called} calls {wrapped} and does not declare it, so long steps and fast drones would not be "
+            f"detected; give functools.wraps({wrapped})({called})"
         )
 
 

@@ -1,6 +1,6 @@
 """Observation terms by name, each with a bound; an observation is their concatenation.
 
-`kinematics` is equation 7 of the paper, `adjacency` equation 8; images (equation 9) belong to the environment.
+`kinematics` is equation 7 of Panerati et al. 2021, `adjacency` equation 8; images (equation 9) are in `vision`.
 """
 
 import dataclasses
@@ -81,7 +81,7 @@ def omega(task: Task, world: World) -> Array:
 
 
 def omega_world(task: Task, world: World) -> Array:
-    """Angular velocity, rad/s, world axes, as in the paper."""
+    """Angular velocity, rad/s, world axes, as in gym-pybullet-drones."""
     return jax.vmap(rotation.rotate)(world.drones.quat, world.drones.omega)
 
 

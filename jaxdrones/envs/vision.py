@@ -1,4 +1,4 @@
-"""Camera images as observations (equation 9 of the paper), on either backend."""
+"""Camera images as observations (equation 9 of Panerati et al. 2021), on either backend."""
 
 import dataclasses
 import math

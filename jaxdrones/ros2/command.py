@@ -79,8 +79,8 @@ def control(
     """Rotor speeds of one drone, RPM.
 
     Positions and velocities are tracked by a controller of `CONTROLLERS`, body rates by the inner loop of `rates`;
-    rotor speeds pass unchanged. A velocity command uses the present position as set-point, as in the velocity input of
-    the paper. `dt` is the control period, s.
+    rotor speeds pass unchanged. A velocity command uses the present position as set-point, as the velocity input of
+    gym-pybullet-drones does. `dt` is the control period, s.
     """
     flown = CONTROLLERS[controller]
     yaw = rotation.to_rpy(state.quat)[2]

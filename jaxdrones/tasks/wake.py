@@ -34,7 +34,7 @@ def wake(
 ) -> Task:
     """Drones at different altitudes swing along crossing lines and pass below each other, in each other's downwash.
 
-    All pass the common vertical axis at the same time, twice a period, which is where the paper's drones meet.
+    All pass the common vertical axis at the same time, twice a period.
 
     Args:
         drones: number of drones, at least two.

@@ -225,7 +225,7 @@ def test_gradients_of_teams_are_one_kernel_inside_jit_too():
 def test_without_the_interfaces_that_it_needs_it_is_vmap_and_says_so_once(monkeypatch):
     monkeypatch.setattr(compiler, "AVAILABLE", False)
     worlds._warn_of_version.cache_clear()
-    with pytest.warns(RuntimeWarning, match="over_worlds is jax.vmap here") as caught:
+    with pytest.warns(RuntimeWarning, match="over_worlds uses jax.vmap") as caught:
         for _ in range(2):
             flown = jd.over_worlds(fly)(starts, commands)
     assert len(caught) == 1

@@ -59,7 +59,7 @@ def test_a_scene_that_is_bound_is_not_replaced():
     assert_close(
         Physics([bound]).wrench(TEAM, START, Scene()), Physics([with_default]).wrench(TEAM, START, SCENE), 1e-9
     )
-    with pytest.raises(ValueError, match="obstacle_contact has a scene of its own"):
+    with pytest.raises(ValueError, match="obstacle_contact has a bound scene"):
         jd.make_step(effects=[functools.partial(jd.obstacle_contact, scene=SCENE)])
 
 

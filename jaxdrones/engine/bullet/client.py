@@ -164,7 +164,7 @@ class Client:
     def _load_egl(self) -> None:
         spec = importlib.util.find_spec("eglRenderer")
         if spec is None or self.p.loadPlugin(spec.origin, "_eglRendererPlugin", physicsClientId=self.id) < 0:
-            raise OSError("Bullet's EGL renderer cannot be loaded; it needs a GPU and its driver, or take 'tiny'")
+            raise OSError("Bullet's EGL renderer cannot be loaded; give renderer='tiny', or install a GPU driver")
 
     def _add_drone(self, radius: float, height: float, offset: float, prop_radius: float, *rotor_pos: float) -> int:
         p = self.p

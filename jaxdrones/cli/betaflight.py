@@ -33,21 +33,21 @@ def add(commands) -> None:
         "betaflight",
         help="fly with Betaflight itself in the loop",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Simulate a drone whose motors Betaflight commands. Its own program (SITL) runs beside it\n"
-        "and exchanges packets with it on 127.0.0.1. It is started, or joined if it runs already (its port 5761\n"
-        "of MSP answers), configured and armed by MSP, and flown in acro by the sticks of a pilot: the outer loop\n"
-        "of the controller `rates`, a policy, or a joystick. Ctrl-C ends the flight and writes its log.\n\n"
+        description="Simulate a drone whose motors Betaflight commands. Betaflight's program (SITL) exchanges packets\n"
+        "with the simulation on 127.0.0.1. The command starts the program, or uses one that is already running (its\n"
+        "MSP port 5761 answers), configures and arms it by MSP, and flies in acro mode by the sticks of a pilot: the\n"
+        "outer loop of the controller `rates`, a policy, or a joystick. Ctrl-C ends the flight and writes its log.\n\n"
         "`jaxdrones betaflight --build` downloads the source (GPL-3.0; package `betaflight`) and compiles it once,\n"
-        "with gcc and make, into ~/.cache/jaxdrones/betaflight; BETAFLIGHT_SITL is the path of another program.",
+        "with gcc and make, into ~/.cache/jaxdrones/betaflight. BETAFLIGHT_SITL=PATH selects another program.",
     )
-    parser.add_argument("--build", action="store_true", help="download and compile Betaflight, and end")
-    parser.add_argument("--if-missing", action="store_true", help="with --build: not if it is built already")
+    parser.add_argument("--build", action="store_true", help="download and compile Betaflight, then exit")
+    parser.add_argument("--if-missing", action="store_true", help="with --build: do nothing if the program exists")
     add_vehicle(parser, "racer")
     pilots = parser.add_argument_group("pilot")
     clock = parser.add_argument_group("clock")
     files = parser.add_argument_group("files and output")
     pilots.add_argument("--target", default="0,0,1.5", metavar="X,Y,Z", help="position to fly to, m (0,0,1.5)")
-    pilots.add_argument("--flip", type=float, metavar="S", help="roll once around this long after arming, s")
+    pilots.add_argument("--flip", type=float, metavar="S", help="time of a flip after arming, s")
     pilots.add_argument("--policy", type=folder, metavar="RUN", help="fly a policy, with action=thrust_and_rates")
     pilots.add_argument("--joystick", type=Path, metavar="DEVICE", help="fly by hand, such as /dev/input/js0")
     pilots.add_argument(
@@ -59,9 +59,9 @@ def add(commands) -> None:
     clock.add_argument("--duration", type=float, metavar="S", help="simulated time after arming, s (until Ctrl-C)")
     clock.add_argument("--physics-hz", type=int, default=1000, metavar="HZ", help="states per second (1000)")
     clock.add_argument(
-        "--real-time", action="store_true", help="follow the clock; else each state waits for the motors"
+        "--real-time", action="store_true", help="follow the clock; by default each step waits for motor outputs"
     )
-    clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until it is armed, s (30)")
+    clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time to arm Betaflight, s (30)")
     add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
     ranges = dict(duration=number("s", above=0), wait=number("s", above=0), flip=number("s", at_least=0))
     parser.set_defaults(run=_run, ranges=ranges | dict(physics_hz=whole("rate of the physics (Hz)", limit=_MAX_HZ)))
@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
     if options.build:
         there = options.if_missing and _is_built()
-        say(f"{betaflight.find_program()} is there" if there else f"built {build(say)}")
+        say(f"{betaflight.find_program()} exists" if there else f"built {build(say)}")
         return 0
     if options.if_missing:
         raise UserError("--if-missing is given without --build; give both or none")
@@ -86,7 +86,7 @@ def _run(options: argparse.Namespace) -> int:
         link = stack.enter_context(betaflight.Link())
         simulation = betaflight.Simulation(options.vehicle, options.physics_hz)
         pilot, target = _pilot(options, simulation, stack)
-        say("a running Betaflight is joined" if program is None else f"{program} is started")
+        say("using the running Betaflight" if program is None else f"starting {program}")
         process = None if program is None else stack.enter_context(betaflight.Process(program))
         recorder = Recorder()
         flight = betaflight.Flight(
@@ -119,7 +119,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace) -> None:
     if options.policy is not None and options.joystick is not None:
-        raise UserError("--policy and --joystick are given; one of them can hold the sticks")
+        raise UserError("--policy and --joystick are given; give one of them")
     if options.joystick is not None and options.flip is not None:
         raise UserError("--flip is given beside --joystick; leave it out")
     options.target = _numbers("target", options.target, 3, float)

@@ -140,15 +140,15 @@ def test_after_a_restart_betaflight_is_armed_again_and_the_racer_hovers(link):
 
     trial = fly(link, TAKE_OFF + 12, act=kill)
     assert trial.flight.flown.lost == 1 and killed
-    assert any("sent no motors" in text for text in trial.warnings)
-    assert any("it is started again" in text for text in trial.warnings)
+    assert any("sent no motor outputs" in text for text in trial.warnings)
+    assert any("it is restarted" in text for text in trial.warnings)
     assert trial.error[-200:].max() < 0.2
 
 
 def test_a_betaflight_that_never_comes_is_reported(link):
     simulation = Simulation("racer")
     flight = Flight(simulation, link, Hover(simulation.params), wait=0.3)
-    with pytest.raises(BetaflightLost, match=r"was not armed within 0\.3 s: there is no answer on its port of MSP"):
+    with pytest.raises(BetaflightLost, match=r"was not armed within 0\.3 s: its MSP port does not answer"):
         flight.run(1.0)
 
 

@@ -25,7 +25,7 @@ _NOT_ARMED = "arm switch"  # reason that follows from the others
 
 
 class BetaflightLost(Exception):
-    """Betaflight that does not start, arm or come back."""
+    """Failure of Betaflight to start, arm or recover."""
 
 
 @dataclasses.dataclass
@@ -38,7 +38,7 @@ class Flown(Pace):
     motors: int = 0
     """Packets of the motors."""
     repeated: int = 0
-    """States in lockstep that were sent again, because no motors came within 10 ms."""
+    """States in lockstep that were sent again, because no motor outputs arrived within 10 ms."""
     lost: int = 0
     """Number of times that Betaflight was silent for 0.5 s, or 3 s in lockstep."""
 
@@ -63,11 +63,11 @@ class Flight:
         Args:
             simulation: drone on the ground.
             link: to Betaflight.
-            pilot: of the sticks, 100 times a second of simulated time, once it is armed.
-            process: of Betaflight, to be started again if it ends; `None` for one that others started.
-            lockstep: whether each step waits for the motors, and repeats its state until they come; without it a
-                flight needs a computer that is not busy. It is never faster than the clock.
-            wait: longest time until Betaflight is armed, at the start and after it was lost, s.
+            pilot: function for the sticks, called 100 times per second of simulated time once Betaflight is armed.
+            process: of Betaflight, restarted if it ends; `None` for a program that this object does not control.
+            lockstep: whether each step waits for motor outputs and resends its state until they arrive; without it
+                a flight needs two idle cores. A flight is never faster than the clock.
+            wait: longest time until Betaflight is armed, at the start and after a loss of connection, s.
             on_row: called with time (s), sample and sticks 100 times a second.
             warn: function of a line of text for warnings.
         """
@@ -98,17 +98,17 @@ class Flight:
         return self.flown
 
     def _lose(self) -> None:
-        """Betaflight is silent: the motors stop, and it has to be armed again."""
+        """Stop the motors after a loss of connection; Betaflight must be armed again."""
         self.flown.lost += 1
-        self._warn(f"Betaflight sent no motors for {self._silent:g} s; they stop")
+        self._warn(f"Betaflight sent no motor outputs for {self._silent:g} s; the motors stop")
         self._armed_at, self._sticks, self._outputs, self._booted = None, Sticks(), np.zeros(4), False
 
     def _arm(self) -> None:
-        """Wait until Betaflight is there, configure it, and arm it; the simulation runs on."""
-        end, why = time.monotonic() + self._wait, "there is no answer on its port of MSP"
+        """Wait for Betaflight, configure it, and arm it; the simulation continues."""
+        end, why = time.monotonic() + self._wait, "its MSP port does not answer"
         while time.monotonic() < end:
             if self._process is not None and self._process.ended:
-                self._warn(f"Betaflight has ended ({self._process.last_words}); it is started again")
+                self._warn(f"Betaflight has ended ({self._process.last_words}); it is restarted")
                 self._process.restart()
             connection = connect_msp()
             if connection is None:
@@ -126,7 +126,7 @@ class Flight:
         raise BetaflightLost(f"Betaflight was not armed within {self._wait:g} s: {why}")
 
     def _arm_by(self, client: msp.Client, end: float) -> str:
-        """Configure and arm; an empty text, or why not at the time `end`."""
+        """Configure and arm until the time `end`; return the reason for a failure, or an empty string."""
         self._run_for(_BOOT)
         for _ in range(_FIRST):  # disarms a Betaflight whose simulator was killed, which takes no settings while armed
             self._link.send_sticks(rc_packet(self._simulation.time, Sticks()))
@@ -135,9 +135,9 @@ class Flight:
         again = settings.configure(client, plant.params, 1 / plant.dt, reversed_yaw=plant.reversed_yaw)
         if again and self._process is not None:
             self._process.restart()
-            return "it is started again with its settings"
+            return "it is restarting with new settings"
         if again:
-            self._warn("the joined Betaflight takes the rate of its loop when it is started again; it flies without")
+            self._warn("the running Betaflight keeps its old loop rate until you restart it")
         first = plant.packet()
         for _ in range(_FIRST):  # with one time: the pace of Betaflight's clock begins afterwards
             self._link.send_state(first)
@@ -149,9 +149,9 @@ class Flight:
             ran = time.monotonic() if now.cycle else ran
             if time.monotonic() > ran + _STUCK:
                 if self._process is not None:
-                    self._warn("Betaflight's loop does not run; it is started again")
+                    self._warn("Betaflight's loop does not run; it is restarted")
                     self._process.restart()
-                return "its loop does not run; start it again"
+                return "its loop does not run; restart it"
             reasons = [reason for reason in now.reasons if reason != _NOT_ARMED]
             why = f"it reports {', '.join(reasons) or 'nothing'}"
             x, y = self._simulation.sample.quat[:2]
@@ -196,7 +196,7 @@ class Flight:
         self.flown.real_s = time.monotonic() - self._begin
 
     def _receive(self, packet: bytes) -> None:
-        """Take the motors; in lockstep, send the state again and again until they come or Betaflight is lost."""
+        """Receive motor outputs; in lockstep, resend the state until they arrive or Betaflight is lost."""
         waits = self._lockstep and self._booted
         found = self._link.outputs(_REPLY if waits else 0.0)
         while waits and not found and time.monotonic() - self._heard < self._silent:

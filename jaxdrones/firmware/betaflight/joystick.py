@@ -16,11 +16,11 @@ _AXIS = 2
 _INITIAL = 0x80  # bit of the kind of events that tell the first positions
 _FULL = 32767
 AXES = (0, 1, 2, 3)
-"""Numbers of the axes for roll, pitch, throttle and yaw, as a transmitter of RC sends them."""
+"""Numbers of the axes for roll, pitch, throttle and yaw, in the order of RC transmitters."""
 
 
 class Joystick(contextlib.AbstractContextManager["Joystick"]):
-    """Pilot who holds a joystick; its switches are not used."""
+    """Pilot with the stick positions of a joystick; its switches are not used."""
 
     def __init__(self, device: Path, axes: Sequence[int] = AXES):
         """Open a joystick, such as /dev/input/js0.

@@ -23,11 +23,11 @@ class Frame(NamedTuple):
     command: int
     data: bytes
     failed: bool = False
-    """Whether it says that a request was refused."""
+    """Whether the request was rejected."""
 
 
 class NoAnswer(Exception):
-    """Lack of an answer, or a refused request."""
+    """Missing answer, or rejected request."""
 
 
 def encode(command: int, data: bytes = b"", direction: bytes = _TO) -> bytes:
@@ -79,7 +79,7 @@ class Client:
         """Answer to a request.
 
         Raises:
-            NoAnswer: none within a second, three times, or a refused request.
+            NoAnswer: three times no answer within a second, or a rejected request.
         """
         for _ in range(_TRIES):
             try:
@@ -90,11 +90,11 @@ class Client:
                     for frame in self._decoder.feed(self._received()):
                         if frame.command == command:
                             if frame.failed:
-                                raise NoAnswer(f"Betaflight refused request {command} of MSP")
+                                raise NoAnswer(f"Betaflight rejected MSP request {command}")
                             return frame.data
             except OSError as error:
-                raise NoAnswer(f"Betaflight closed the connection of MSP ({error.strerror or error})") from None
-        raise NoAnswer(f"Betaflight did not answer request {command} of MSP within {_TIMEOUT:g} s, {_TRIES} times")
+                raise NoAnswer(f"Betaflight closed the MSP connection ({error.strerror or error})") from None
+        raise NoAnswer(f"Betaflight did not answer MSP request {command} within {_TIMEOUT:g} s, {_TRIES} times")
 
     def _received(self) -> bytes:
         try:

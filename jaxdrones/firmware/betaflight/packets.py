@@ -51,7 +51,7 @@ class Sticks(NamedTuple):
     armed: bool = False
     """Switch of AUX1."""
     angle: bool = False
-    """Switch of AUX2: whether Betaflight levels; else roll and pitch are rates (acro)."""
+    """Switch of AUX2: angle mode, in which Betaflight levels the drone; else roll and pitch are rates (acro mode)."""
 
 
 def state_packet(t: float, quat: np.ndarray, omega: np.ndarray, specific_force: np.ndarray) -> bytes:
@@ -69,7 +69,7 @@ def state_packet(t: float, quat: np.ndarray, omega: np.ndarray, specific_force: 
 
 
 def rc_packet(t: float, sticks: Sticks) -> bytes:
-    """Packet of the receiver at a simulated time (s); sticks beyond their ends are at their ends."""
+    """Packet of the receiver at a simulated time (s); stick positions are clipped to their ranges."""
     packet = np.zeros((), RC)
     channels = np.full(CHANNELS, 1000)
     centered = np.nan_to_num(np.array([sticks.roll, sticks.pitch, sticks.yaw], float))

@@ -53,12 +53,12 @@ class Hover:
 
 @dataclasses.dataclass(frozen=True)
 class TakeOff:
-    """Take-off by one pilot, after which another one, who cannot take off, holds the sticks."""
+    """Take-off by one pilot, followed by another one that cannot take off."""
 
     first: Pilot
     """Pilot until `after`."""
     then: Pilot
-    """Pilot afterwards; his time begins then."""
+    """Pilot afterwards, called with the time since `after`."""
     after: float
     """Time since arming, s."""
 

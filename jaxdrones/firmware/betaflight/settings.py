@@ -72,23 +72,23 @@ class Status(NamedTuple):
 
 
 def configure(client: msp.Client, params: Params, hz: float, reversed_yaw: bool = False) -> bool:
-    """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe, yaw and the direction of the motors.
+    """Configure switches (AUX1 arms, AUX2 selects angle mode), linear rates, failsafe, yaw gain and motor direction.
 
-    The rate of the control loop becomes twice that of the states, and the low-pass filters of the gyroscope, which has
-    no noise, are off: on a busy computer the loop runs less often, which makes filters and derivatives slower. All
-    settings are saved in `eeprom.bin` in the folder of the process.
+    The rate of the control loop becomes twice that of the states. The low-pass filters of the gyroscope are off,
+    because it has no noise, and because filters and derivatives become slower when a busy computer runs the loop less
+    often. All settings are saved in `eeprom.bin` in the folder of the process.
 
     Args:
         client: connection.
-        params: those of the drone, for the gain about its yaw axis.
+        params: of the drone, for the yaw gain.
         hz: states per second.
         reversed_yaw: whether the motors turn in the opposite of Betaflight's default direction.
 
     Raises:
-        msp.NoAnswer: no answer, or settings that were not taken.
+        msp.NoAnswer: no answer, or rejected settings.
 
     Returns:
-        Whether Betaflight must be started again for the rate of its loop and its filters.
+        Whether Betaflight must be restarted for its loop rate and filters.
     """
     for slot, mode in enumerate((_ARM, _ANGLE)):
         client.request(msp.SET_MODE_RANGE, mode_range(slot, mode, slot))
@@ -105,12 +105,12 @@ def configure(client: msp.Client, params: Params, hz: float, reversed_yaw: bool 
     slower = _with_loop(client, hz)
     client.request(msp.EEPROM_WRITE)
     if client.request(msp.RC_TUNING)[: len(tuning)] != tuning or client.request(msp.PID) != gains:
-        raise msp.NoAnswer("Betaflight did not take the rates and gains; it is another version than 4.6")
+        raise msp.NoAnswer("Betaflight did not accept the rates and gains; use version 4.6")
     return slower
 
 
 def yaw_gain(params: Params) -> int:
-    """Proportional gain about the yaw axis, with which a hovering drone follows as fast as by the controller `rates`.
+    """Proportional gain about the yaw axis with which a hovering drone responds as fast as with the controller `rates`.
 
     Betaflight's default, 45, suits propellers of larger torque; with those of the racer, the integral term oscillates.
     """
@@ -120,11 +120,11 @@ def yaw_gain(params: Params) -> int:
 
 
 def _with_loop(client: msp.Client, hz: float) -> bool:
-    """Set the rate of the control loop and switch filters off; whether this changes something."""
+    """Set the rate of the control loop and switch filters off; return whether this is a change."""
     old = client.request(msp.ADVANCED), client.request(msp.FILTERS)
     advanced, filters = map(bytearray, old)
     if len(advanced) < 2 or len(filters) < _DYNAMIC.stop:
-        raise msp.NoAnswer("Betaflight's settings are shorter than those of 4.6; it is another version")
+        raise msp.NoAnswer("Betaflight's settings are shorter than those of version 4.6; use this version")
     advanced[1] = min(max(round(_GYRO_HZ / (_LOOPS * hz)), 1), _MOST_DENOMINATOR)
     for place in (_FIRST_LOW_PASS, _LOW_PASS, _DYNAMIC):
         filters[place] = bytes(place.stop - place.start)
@@ -153,6 +153,6 @@ def parse_status(data: bytes) -> Status:
         more = data[_STATUS.size] & 0x0F  # bytes of further modes
         _, flags = struct.unpack_from("<BI", data, _STATUS.size + 1 + more)
     except (struct.error, IndexError):
-        raise msp.NoAnswer(f"Betaflight's status has {len(data)} bytes; it is another version than 4.6") from None
+        raise msp.NoAnswer(f"Betaflight's status has {len(data)} bytes, not that of version 4.6; use it") from None
     reasons = tuple(name for bit, name in enumerate(FLAGS) if flags >> bit & 1)
     return Status(bool(modes & 1), cycle, reasons)

@@ -34,11 +34,11 @@ class Simulation:
         self.params, self.dt, self.steps = load_params(vehicle), 1 / hz, 0
         pos, spin = np.asarray(self.params.rotor_pos), np.asarray(self.params.rotor_spin)
         if sorted(np.sign(pos[:, 0]) + 2 * np.sign(pos[:, 1])) != [-3, -1, 1, 3]:
-            raise UserError(f"{vehicle} has rotors on its axes; Betaflight's mixer is for an X, give such a vehicle")
+            raise UserError(f"{vehicle} has rotors on its body axes; give a vehicle in X configuration")
         self._motor_of_rotor = motor_order(pos)
         turns = spin * _SPINS[self._motor_of_rotor]
         if abs(turns.sum()) != 4:
-            raise UserError(f"{vehicle} has rotors with the directions {spin.tolist()}; neighbors must turn oppositely")
+            raise UserError(f"{vehicle} has rotors with the directions {spin.tolist()}; give alternating ones")
         self.reversed_yaw = bool(turns[0] < 0)
         """Whether the rotors turn in the opposite of Betaflight's default direction: props out."""
         step = drone.make_physics(self.dt, substeps=-(-_LEAST_HZ // hz))
@@ -53,7 +53,7 @@ class Simulation:
         return self.steps * self.dt
 
     def packet(self) -> bytes:
-        """State packet of the present sample."""
+        """State packet of the current sample."""
         return state_packet(self.time, self.sample.quat, self.sample.omega, self.sample.acc)
 
     def advance(self, outputs: np.ndarray) -> Sample:

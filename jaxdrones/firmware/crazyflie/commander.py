@@ -1,4 +1,4 @@
-"""Set-points from the wire: commander and generic commander, and what happens without them."""
+"""Set-points in packets of the commander and the generic commander, and timeouts without them."""
 
 import math
 import struct
@@ -31,7 +31,7 @@ _FORMATS = {  # type -> format of its data
 
 
 class Commander:
-    """Choice of the set-point: the stream of a client, or the high-level commander after it was handed over."""
+    """Source of the set-point: the packets of a client, or the high-level commander after a handover."""
 
     def __init__(self, parameters: Parameters, high_level: HighLevel):
         self._parameters, self.high_level = parameters, high_level
@@ -41,7 +41,7 @@ class Commander:
         self._thrust_locked = True
 
     def rpyt(self, data: bytes, t: float) -> None:
-        """Take roll, pitch, yaw rate and thrust; a thrust of zero must come first, as a lock against accidents."""
+        """Set roll, pitch, yaw rate and thrust; as a safety lock, the first packet must have zero thrust."""
         if len(data) != 14:
             return
         roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
@@ -59,7 +59,7 @@ class Commander:
         self._stream(target(thrust=thrust, **which, **heading), t)
 
     def generic(self, channel: int, data: bytes, t: float) -> None:
-        """Take a set-point of any kind, or the end of a stream."""
+        """Set a set-point of any kind, or end a stream."""
         if channel == _META:
             if len(data) == 5 and data[0] == 0:
                 self._valid_until = t + struct.unpack("<I", data[1:])[0] / 1000

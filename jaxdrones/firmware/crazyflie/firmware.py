@@ -1,4 +1,4 @@
-"""Simulated Crazyflie: what it answers to packets, and what it does in 10 ms."""
+"""Simulated Crazyflie: its answers to packets, and its flight in steps of 10 ms."""
 
 import dataclasses
 import struct
@@ -40,10 +40,10 @@ class Crazyflie:
     """
 
     def __init__(self, vehicle: Vehicle):
-        """Start on the ground, with a vehicle that nobody else flies."""
+        """Start on the ground; the vehicle must not be used elsewhere."""
         self.vehicle = vehicle
         self.rows = 0
-        """Number of periods of 10 ms that were flown."""
+        """Number of simulated periods of 10 ms."""
         self.parameters = Parameters(vehicle.gains, self._set_gains)
         self.high_level = HighLevel()
         self.commander = Commander(self.parameters, self.high_level)
@@ -126,7 +126,7 @@ class Crazyflie:
         return data if channel == 0 else None
 
     def _hear_position(self, client: _Client, channel: int, data: bytes) -> None:
-        """Emergency stops; positions from outside are not needed, because the state is known."""
+        """Emergency stops; external positions are ignored, because the state is known."""
         if channel == 1 and data[:1] in (bytes([_EMERGENCY]), bytes([_EMERGENCY_WATCHDOG])):
             self.supervisor.emergency(data[0] == _EMERGENCY_WATCHDOG, self.time)
 

@@ -1,4 +1,4 @@
-"""Parameters of the vehicle: those of the firmware that act here, and those that scripts ask for."""
+"""Parameters of the vehicle: those with an effect on the simulation, and those that scripts request."""
 
 import struct
 from collections.abc import Callable

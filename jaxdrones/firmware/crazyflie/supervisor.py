@@ -18,9 +18,9 @@ class Supervisor:
     """State of the vehicle that decides whether its motors may turn."""
 
     armed: bool = True
-    """As a vehicle with brushed motors, it is armed when it starts."""
+    """Whether the motors are armed; true at the start, as for a vehicle with brushed motors."""
     locked: bool = False
-    """After an emergency stop, until the simulation is restarted."""
+    """Whether the motors are locked: after an emergency stop, until the simulation is restarted."""
     tumbled: bool = False
     recovery_asked: bool = False
     """Whether the vehicle is to be set upright."""
@@ -33,7 +33,7 @@ class Supervisor:
         return self.armed and not (self.locked or self.tumbled)
 
     def watch(self, sample: Sample, t: float, dt: float) -> None:
-        """Look at the vehicle at time t (s), dt (s) after the last time."""
+        """Update from the state of the vehicle at time t (s), dt (s) after the last call."""
         x, y = sample.quat[:2]
         self._upside_down = self._upside_down + dt if 2 * (x * x + y * y) > 1 else 0.0
         self.tumbled |= self._upside_down > _TUMBLED_AFTER
@@ -75,7 +75,7 @@ class Supervisor:
         return b""
 
     def emergency(self, watchdog: bool, t: float) -> None:
-        """Stop and lock the motors, now, or unless this is repeated within a second."""
+        """Stop and lock the motors: now, or with `watchdog` unless the call is repeated within a second."""
         if watchdog:
             self._watchdog = t + _WATCHDOG
         else:

@@ -14,7 +14,7 @@ _VOLTAGE = 4.0  # V; the battery does not discharge
 
 
 class Readings(NamedTuple):
-    """What is logged at one time."""
+    """Logged data of one instant."""
 
     sample: Sample
     target: Target

@@ -106,7 +106,7 @@ def test_a_run_of_user_files_refuses_what_has_changed(here, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["eval", "my_policy.py:policy"], "--task is missing; give the task that my_policy.py:policy flies"),
+        (["eval", "my_policy.py:policy"], "--task is missing; give the task for my_policy.py:policy"),
         (["eval", "my_policy.py:pol", "--task", "hover"], "defines no 'pol'; did you mean 'policy'?"),
         (["eval", "my_policy.py", "--task", "hover"], "give my_policy.py:NAME"),
         (

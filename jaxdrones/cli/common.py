@@ -54,7 +54,7 @@ def print_error(message: str, code: int = MISTAKE) -> int:
 
 @contextlib.contextmanager
 def lasting_interrupts():
-    """Context in which SIGTERM is a Ctrl-C, and one dropped by Python, as in its garbage collector, is repeated."""
+    """Context in which SIGTERM acts like Ctrl-C, and a Ctrl-C that Python drops (in garbage collection) is repeated."""
     before, timers = sys.unraisablehook, []
     is_main = threading.current_thread() is threading.main_thread()
     terminate = signal.signal(signal.SIGTERM, signal.default_int_handler) if is_main else None
@@ -112,7 +112,7 @@ def _explained(error: BaseException) -> str | None:
     in_program = type(error).__name__ == "InternalFloatingPointError"  # which JAX raises for a compiled program
     if (in_program or isinstance(error, FloatingPointError)) and _DEBUG.intersection(os.environ):
         found = f"there is {error.args[1]} in {error.args[0]}" if in_program else error
-        return f"{found}, as {' and '.join(sorted(_DEBUG.intersection(os.environ)))} asked to find"
+        return f"{found}; {' and '.join(sorted(_DEBUG.intersection(os.environ)))} made this an error"
     try:
         machine.devices()
     except UserError as missing:

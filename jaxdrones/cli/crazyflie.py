@@ -25,7 +25,7 @@ def add(commands) -> None:
         description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib\n"
         "connect to udp://127.0.0.1:PORT; those that use `uri_from_env` run unchanged after\n"
         f"{_EXAMPLE}\n\n"
-        "There are parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"
+        "It supports parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"
         "trajectories, arming and emergency stops. Ctrl-C ends the flight and writes its log.",
     )
     add_vehicle(parser, "cf2x")

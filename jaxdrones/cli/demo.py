@@ -29,22 +29,22 @@ def add(commands) -> None:
         "demo",
         help="open a page of flights by bundled policies",
         description="Open a page in the browser that plays recorded flights of the bundled policies: through a forest, "
-        "through gates, in a crowd, and others. One drone is simulated in the page, in another flight twenty; push "
-        "them. It needs no network.",
-        epilog="`jaxdrones demo forest --live` flies one of them now, `jaxdrones eval forest` evaluates its policy.",
+        "through gates, in a crowd, and others. It also simulates one or twenty drones interactively. It needs no "
+        "network.",
+        epilog="`jaxdrones demo forest --live` simulates a new flight, `jaxdrones eval forest` evaluates its policy.",
     )
     parser.add_argument("flight", nargs="?", default=_FIRST, metavar="FLIGHT", help=f"flight to show first ({_FIRST})")
     parser.add_argument(
         "--policy",
         type=folder,
         metavar="RUN",
-        help="simulate --drones drones with this policy first: a run of hover for one drone; or file.py:name, whose "
-        "code is executed; needs casadi",
+        help="policy of the interactive simulation of --drones drones: a run of hover for one drone; or file.py:name, "
+        "whose code is executed; needs casadi",
     )
     parser.add_argument("--task", metavar="TASK", help="with file.py:name: task (hover), as for `jaxdrones train`")
     add_set(parser, "with file.py:name: option of the environment (action, observation, ...)")
     add_drones(parser, 1)
-    add_live(parser, "fly FLIGHT now, in place of the page, and show it in the browser in real time")
+    add_live(parser, "instead of the page, simulate FLIGHT and show it in the browser in real time")
     add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
     parser.add_argument("--no-open", action="store_true", help="write the page and do not open it")
     parser.set_defaults(run=_demo)
@@ -56,7 +56,7 @@ def _demo(options: argparse.Namespace) -> int:
     if options.drones != 1 and options.policy is None:
         raise UserError(f"--drones {options.drones} is given without --policy; 'fly twenty' simulates twenty drones")
     if (options.task or options.set) and not (options.policy and is_user_policy(options.policy)):
-        raise UserError("--task and --set are for --policy file.py:name; leave them out, or give such a policy")
+        raise UserError("--task or --set is given without --policy file.py:name; leave it out, or give both")
     if options.live is not None:
         return _fly(flight, options)
     if options.policy is not None:
@@ -77,7 +77,7 @@ def _demo(options: argparse.Namespace) -> int:
 def _fly(exhibit: Exhibit, options: argparse.Namespace) -> int:
     words = shlex.split(exhibit.command)
     if words[1] != "fly":
-        raise UserError(f"no bundled policy flies {exhibit.name!r}; give --live with forest, for example")
+        raise UserError(f"{exhibit.name!r} has no bundled policy for --live; give another flight, for example forest")
     if options.policy is not None or options.output is not None:
         raise UserError("--live flies a bundled policy and writes no page; leave out --policy and --output")
     commands = argparse.ArgumentParser().add_subparsers()

@@ -27,8 +27,8 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "doctor",
         help="check versions, devices, extras, and run a self-test",
-        description="Print versions, devices and installed extras, and fly a self-test with a closed-form solution. "
-        "Missing extras are no problem.",
+        description="Print versions, devices and installed extras, and compare a simulation with a closed-form "
+        "solution. Missing extras are not an error.",
     )
     parser.set_defaults(run=_doctor)
 
@@ -133,7 +133,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 def _notes(devices: list[str]) -> list[str]:
     if devices and shutil.which("nvidia-smi") and all(device.startswith("cpu") for device in devices):
-        return ['an NVIDIA driver is there, but jax computes on the CPU; pip install "jax[cuda12]" for the GPU']
+        return ['an NVIDIA driver is installed, but jax uses the CPU; pip install "jax[cuda12]" for the GPU']
     return []
 
 
@@ -147,6 +147,6 @@ def _self_tests(extras: dict[str, dict[str, Any]], wrong: list[str]) -> dict[str
             problem = self_test(backend)
         except Exception as error:  # whatever a broken installation raises
             problem = f"{type(error).__name__}: {error}"
-        results[backend] = problem or f"a second of flight as computed by hand ({time.perf_counter() - begin:.1f} s)"
+        results[backend] = problem or f"agrees with the closed-form solution ({time.perf_counter() - begin:.1f} s)"
         wrong += [f"self-test on the {backend} backend: {problem}"] if problem else []
     return results

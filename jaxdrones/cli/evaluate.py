@@ -25,8 +25,8 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or one for all "
-        "vehicles. Print the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
+        description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or a policy for "
+        "all vehicles. Print the success rate with its 95 % interval over distinct episodes, errors, and terminations.",
     )
     add_policy(parser, "any-vehicle or raptor; ")
     evaluation = parser.add_argument_group("evaluation")

@@ -26,7 +26,7 @@ def add(commands) -> None:
     parser.add_argument("--to", required=True, metavar="TARGET", help=", ".join(TARGETS))
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
-    parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
+    parser.add_argument("--last", action="store_true", help="export the newest policy instead of the best")
     parser.set_defaults(run=_export, ranges=dict(to=choice("target", TARGETS)))
 
 

@@ -28,9 +28,9 @@ def add(commands) -> None:
         "fit",
         help="identify a vehicle from recorded flights",
         description="Estimate parameters of a vehicle from flights: logs of `jaxdrones fly`, .npz or .csv files with "
-        "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Print each with its standard error, "
-        "and write a folder with vehicle.urdf, report.json and a figure. "
-        "Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
+        "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Print the estimates with standard "
+        "errors, and write a folder with vehicle.urdf, report.json and a figure. Other commands take vehicle.urdf as "
+        "--vehicle; `jaxdrones score` takes the folder.",
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")
     model = parser.add_argument_group("model and data")
@@ -47,7 +47,7 @@ def add(commands) -> None:
         type=folder,
         default=[],
         metavar="FLIGHT",
-        help="held-out flights for the choice of the best round",
+        help="held-out flights to choose the best round of the fit",
     )
     add_log_options(model)
     add_output(files, "folder of the fit, without an earlier fit (runs/fit)", Path("runs/fit"))

@@ -46,7 +46,7 @@ def add_policy(parser: argparse.ArgumentParser, others: str = "") -> argparse._A
         help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
         f"{others}or file.py:name, whose code is executed",
     )
-    own = parser.add_argument_group("your own policy", "only for a policy that is no run")
+    own = parser.add_argument_group("your own policy", "only for a policy that is not a run")
     own.add_argument("--task", metavar="TASK", help="task of the policy, as for `jaxdrones train`")
     add_vehicle(own)
     add_realistic(own)
@@ -82,7 +82,7 @@ def open_policy(
     """
     if is_user_policy(policy):
         if task is None:
-            raise UserError(f"--task is missing; give the task that {policy} flies, for example --task hover")
+            raise UserError(f"--task is missing; give the task for {policy}, for example --task hover")
         return UserPolicy(str(policy), task, realistic, options)
     given = {"--task": task, "--realistic": realistic, **{f"--set {name}": x for name, x in options.items()}}
     for name, x in given.items():

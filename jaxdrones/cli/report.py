@@ -18,7 +18,7 @@ _COLUMNS = {  # result: (heading, format)
     "rms_error_m_s": ("rms (m/s)", "{:.4f}"),
     "peak_error_m_s": ("peak (m/s)", "{:.4f}"),
     "steady_error_m_s": ("steady (m/s)", "{:.4f}"),
-    "settled_after_s": ("settled (s)", "{:.2f}"),
+    "settled_after_s": ("settling (s)", "{:.2f}"),
     "lowest_z_m": ("z min (m)", "{:.4f}"),
     "highest_z_m": ("z max (m)", "{:.4f}"),
     "peak_vz_m_s": ("vz max (m/s)", "{:.4f}"),
@@ -110,11 +110,11 @@ def evaluation_table(report: dict) -> str:
 def success(report: dict) -> str:
     """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
     if report["success"] is None:
-        return "the task has no criterion"
+        return "the task has no criterion of success"
     episodes, interval = report["episodes"], report["success_interval"]
     rate = f"{percent(report['success'], episodes)}, {round(report['success'] * episodes):,} of {episodes:,}"
     if interval is None:
-        return f"{rate}, no interval of one distinct episode"
+        return f"{rate}, one distinct episode without an interval"
     low, high = (100 * x for x in interval)
     digits = _digits(episodes) + 1
     return f"{rate}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"

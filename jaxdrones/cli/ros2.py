@@ -33,21 +33,21 @@ _OF_REPLAY = ("bag", "speed", "json", "run", "ranges", "debug")
 
 def add(commands) -> None:
     """Add the command."""
-    parser = commands.add_parser("ros2", help="fly a team on the topics of ROS 2")
+    parser = commands.add_parser("ros2", help="simulate a team with ROS 2 topics")
     team = parser.add_argument_group("team")
     add_drones(team, 1)
     add_vehicle(team, "cf2x")
     add_backend(team)
     team.add_argument(
-        "--controller", metavar="NAME", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's own)"
+        "--controller", metavar="NAME", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's)"
     )
     team.add_argument("--control-hz", type=int, default=100, metavar="HZ", help="control and message rate (100)")
     team.add_argument("--height", type=float, default=1.0, metavar="M", help="initial height, m (1)")
     watch = parser.add_argument_group("clock and failsafe")
     wire = parser.add_argument_group("messages")
     pace = watch.add_mutually_exclusive_group()
-    pace.add_argument("--lockstep", action="store_true", help="advance by calls of the service /step")
-    pace.add_argument("--real-time", action="store_true", help="advance by the clock (default)")
+    pace.add_argument("--lockstep", action="store_true", help="one step for each call of the service /step")
+    pace.add_argument("--real-time", action="store_true", help="follow the clock (default)")
     watch.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
     watch.add_argument("--duration", type=float, metavar="S", help="simulated time, s (until Ctrl-C)")
     wire.add_argument("--camera", metavar="WxH", help="resolution of a camera on every drone, pixels (none)")
@@ -55,7 +55,9 @@ def add(commands) -> None:
     watch.add_argument(
         "--timeout", type=float, default=1.0, metavar="S", help="seconds without a command before the failsafe acts (1)"
     )
-    watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="the same before the first command (30)")
+    watch.add_argument(
+        "--wait", type=float, default=30.0, metavar="S", help="the same timeout before the first command (30)"
+    )
     watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
     wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
     numbers = dict(drones=whole(), speed=number(above=0), duration=number("s", at_least=0), height=number("m", above=0))

@@ -36,7 +36,7 @@ def add(commands) -> None:
         help="a bundled vehicle, URDF, or folder of `jaxdrones fit`",
     )
     parser.add_argument(
-        "--nominal", default=_NOMINAL, metavar="NAME|URDF", help=f"the vehicle to compare with ({_NOMINAL})"
+        "--nominal", default=_NOMINAL, metavar="NAME|URDF", help=f"nominal vehicle, for comparison ({_NOMINAL})"
     )
     add_log_options(parser)
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")

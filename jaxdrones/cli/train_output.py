@@ -72,8 +72,8 @@ class Deadlines:
         spent, budget = time.perf_counter() - self._begin, self._end - self._begin
         if self.seconds is not None and spent > _TOLERANCE * budget + 1:
             print_warning(
-                f"everything took {spent:.0f} s, more than {budget:.0f} s by --budget {self._text}: compiling, one "
-                "update and three evaluations are the least; give a longer --budget or fewer --episodes"
+                f"the command took {spent:.0f} s, more than {budget:.0f} s of --budget {self._text}: compiling, one "
+                "update and three evaluations are the minimum; give a longer --budget or fewer --episodes"
             )
 
 

@@ -68,7 +68,7 @@ def definitions(log: FlightLog, after: float) -> str:
     band = f"{100 * _BAND:g} % or {1000 * _MIN_BAND:g} {unit}"
     return (
         f"steady: mean error from {log.t[log.last_quarter][0]:.2f} s on, the last quarter of the flight\n"
-        f"settling time: first time after which the error stays within {band} of steady (-: in the last quarter)\n"
+        f"settling: first time after which the error stays within {band} of steady (-: in the last quarter)\n"
         f"all other numbers count from {counted_from(log, after):.2f} s on"
     )
 

@@ -78,11 +78,11 @@ def test_an_unknown_flight_is_named(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["real flight", "--live"], "no bundled policy flies 'real flight'"),
+        (["real flight", "--live"], "'real flight' has no bundled policy for --live"),
         (["forest", "--live", "--output", "page.html"], "leave out --policy and --output"),
         (["--drones", "20"], "without --policy"),
-        (["--task", "hover"], "--task and --set are for --policy file.py:name"),
-        (["--policy", "runs/hover", "--set", "reach=1"], "--task and --set are for --policy file.py:name"),
+        (["--task", "hover"], "--task or --set is given without --policy file.py:name"),
+        (["--policy", "runs/hover", "--set", "reach=1"], "--task or --set is given without --policy file.py:name"),
     ],
 )
 def test_options_that_contradict_each_other_are_named(arguments, message, capsys):

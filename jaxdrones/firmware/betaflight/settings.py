@@ -153,6 +153,6 @@ def parse_status(data: bytes) -> Status:
         more = data[_STATUS.size] & 0x0F  # bytes of further modes
         _, flags = struct.unpack_from("<BI", data, _STATUS.size + 1 + more)
     except (struct.error, IndexError):
-        raise msp.NoAnswer(f"Betaflight's status has {len(data)} bytes, not that of version 4.6; use it") from None
+        raise msp.NoAnswer(f"Betaflight's status has {len(data)} bytes, unlike in version 4.6; use 4.6") from None
     reasons = tuple(name for bit, name in enumerate(FLAGS) if flags >> bit & 1)
     return Status(bool(modes & 1), cycle, reasons)

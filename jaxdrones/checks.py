@@ -160,7 +160,7 @@ def hint(name: str, known: Iterable[str]) -> str:
 
 
 def check_sequence(name: str, value: Any, example: str) -> tuple:
-    """Validated entries of a sequence; an iterator, which can be read only once, is none."""
+    """Validated entries of a sequence; iterators, which can be read only once, are rejected."""
     if isinstance(value, str | Iterator) or callable(value) or not isinstance(value, Iterable):
         raise UserError(f"{name} is {short_repr(value)}; give a sequence, for example ({example},)")
     return tuple(value)
@@ -198,7 +198,7 @@ def takes(function: Callable, name: str) -> bool:
 
 
 def bind(function: Callable, **values: Any) -> Callable:
-    """Bind those values to a function for which it has a parameter."""
+    """Bind the values for which a function has a parameter."""
     bound = {name: value for name, value in values.items() if takes(function, name)}
     return functools.partial(function, **bound) if bound else function
 
@@ -206,7 +206,7 @@ def bind(function: Callable, **values: Any) -> Callable:
 def check_arrays(**trees: Any) -> None:
     """Raise unless every field but `aux` of these objects by name is an array or a number.
 
-    JAX takes lists, tuples and `None` apart, not as one array.
+    JAX treats lists, tuples and `None` as trees, not as arrays.
     """
     for name, tree in trees.items():
         for field, leaf in vars(tree).items():
@@ -216,7 +216,7 @@ def check_arrays(**trees: Any) -> None:
 
 
 def check_params(params: Any, finite: bool = True) -> None:
-    """Raise for concrete constants of a drone or a team that cannot fly; without `finite` only if not positive."""
+    """Raise for concrete constants of a drone or a team that cannot fly; without `finite`, only signs are checked."""
     constants = vars(params)
     check_arrays(params=params)
     if finite:

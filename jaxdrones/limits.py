@@ -18,7 +18,7 @@ def check_memory(what: str, size: int, advice: str) -> None:
     """Raise if `what` needs more bytes than this computer has, with advice; `size` is a lower bound."""
     held = memory()
     if size > held:
-        raise UserError(f"{what} needs about {_readable(size)} of memory, there are {_readable(held)}; {advice}")
+        raise UserError(f"{what} needs about {_readable(size)} of memory, and there are {_readable(held)}; {advice}")
 
 
 def memory() -> int:

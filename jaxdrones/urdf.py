@@ -101,7 +101,7 @@ def _params(urdf: "_Urdf") -> Params:
         collision_radius=urdf.number(cylinder, "radius", "collision radius, m", _LENGTH),
         collision_height=urdf.number(cylinder, "length", "collision height, m", _LENGTH),
         collision_offset=urdf.numbers(
-            f"{_BASE}/collision/origin", "xyz", 3, "centre of the collision cylinder, m", _PLACE, default="0 0 0"
+            f"{_BASE}/collision/origin", "xyz", 3, "center of the collision cylinder, m", _PLACE, default="0 0 0"
         )[2],
     )
     urdf.check_what_params_cannot_hold()
@@ -131,23 +131,23 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
     largest = np.max(inertia)
     demand(
         largest <= (np.sum(inertia) - largest) * (1 + 1e-6),
-        f"the moments of inertia {short_repr(inertia)} are those of no body",
-        "each is at most the sum of the other two",
+        f"the moments of inertia {short_repr(inertia)} are impossible for a rigid body",
+        "give moments of at most the sum of the other two",
     )
     x, y, _ = v["rotor_pos"].T
     spin = v["rotor_spin"]
     demand(
         np.sum(spin) == 0,
-        f'rotor_spin="{" ".join(f"{s:g}" for s in spin)}" makes a drone that spins when it hovers',
-        "let two rotors turn either way",
+        f'rotor_spin="{" ".join(f"{s:g}" for s in spin)}" makes the drone spin in hover',
+        "give two rotors each direction",
     )
     arm = np.mean(np.hypot(x, y))
     allocation = np.stack([np.ones(4), y / max(arm, _LENGTH[0]), x / max(arm, _LENGTH[0]), spin])
     values = np.linalg.svd(allocation, compute_uv=False)
     demand(
         values[0] <= _CONDITION * values[-1],
-        f"rotors at {short_repr(v['rotor_pos'])} m, spin {short_repr(spin)}, cannot turn a drone about every axis",
-        "place them around the center of mass, with neighbors that turn opposite ways",
+        f"rotors at {short_repr(v['rotor_pos'])} m, spin {short_repr(spin)}, cannot rotate the drone about every axis",
+        "place them around the center of mass, with neighbors that turn in opposite directions",
     )
     full = v["kf"] * max_rpm**2
     torque = np.array([full * np.sum(np.abs(y)) / 2, full * np.sum(np.abs(x)) / 2, 2 * v["km"] * max_rpm**2])
@@ -160,9 +160,9 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
     tumbling = weight * np.hypot(np.mean(y) / inertia[0], np.mean(x) / inertia[1])
     demand(
         tumbling <= _UNBALANCED,
-        f"its rotors are centred on ({np.mean(x):.3g}, {np.mean(y):.3g}) m and tumble it by {tumbling:.3g} rad/s^2 "
+        f"its rotors are centered on ({np.mean(x):.3g}, {np.mean(y):.3g}) m and tumble it by {tumbling:.3g} rad/s^2 "
         "when they carry its weight",
-        "centre them on the centre of mass, the origin of base_link",
+        "center them on the center of mass, the origin of base_link",
     )
     rate = np.max(v["drag_coeff"]) * 4 * max_rpm * 2 * np.pi / 60 / v["mass"]
     demand(rate <= _DRAG_RATE, f"drag takes {rate:.3g} of the speed per second", f"expected at most {_DRAG_RATE:g}")
@@ -178,32 +178,32 @@ class _Urdf:
         except OSError as error:
             raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a URDF file") from None
         except ET.ParseError as error:
-            raise UserError(f"{path}: is not well-formed XML ({error}); mend the file") from None
+            raise UserError(f"{path}: is not well-formed XML ({error}); correct the file") from None
         except (LookupError, ValueError) as error:  # of its encoding, or of its name
             raise UserError(f"{short_repr(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
         if self._root.tag != "robot":
-            raise UserError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
+            raise UserError(f"{path}: is not a URDF, its root is <{self._root.tag}>; give a file with <robot>")
 
     def check_what_params_cannot_hold(self) -> None:
         """Raise for features without a counterpart in `Params`."""
         for joint in self._root.iter("joint"):
             if re.fullmatch(r"rotor\d+", joint.get("name", "")) and joint.get("name") not in _ROTORS:
                 raise UserError(
-                    f"{self.name}: has a joint {joint.get('name')!r}; only quadrotors fly, rotor0 to rotor3"
+                    f"{self.name}: has a joint {joint.get('name')!r}; give only the rotors rotor0 to rotor3"
                 )
         for rotor in _ROTORS:
             parent = self._tag(f"joint[@name='{rotor}']/parent")
             if parent is not None and parent.get("link") != "base_link":
                 raise UserError(
-                    f"{self.name}: {rotor} hangs on {parent.get('link')!r}; give its place relative to base_link"
+                    f"{self.name}: {rotor} is attached to {parent.get('link')!r}; attach it to base_link"
                 )
         origin, collision = f"{_BASE}/inertial/origin", f"{_BASE}/collision/origin"
         upright = "rotors push along body z; give no roll and pitch"
         for path, attribute, count, remedy in (
             *((f"joint[@name='{rotor}']/origin", "rpy", 2, upright) for rotor in _ROTORS),
-            (origin, "xyz", 3, "put the origin of base_link at the centre of mass"),
+            (origin, "xyz", 3, "put the origin of base_link at the center of mass"),
             (origin, "rpy", 3, "turn the body axes into principal axes"),
-            (collision, "xyz", 2, "centre the cylinder on body z"),
+            (collision, "xyz", 2, "center the cylinder on body z"),
             (collision, "rpy", 2, "the cylinder must be along body z; give no roll and pitch"),
         ):
             values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
@@ -217,7 +217,7 @@ class _Urdf:
             mass = link.find("inertial/mass")
             if link.get("name") != "base_link" and mass is not None and not _is_zero(mass.get("value", "0")):
                 raise UserError(
-                    f"{self.name}: the link {link.get('name')!r} has a mass of its own, {mass.get('value')} kg; "
+                    f"{self.name}: the link {link.get('name')!r} has a mass, {mass.get('value')} kg; "
                     "add it, and its inertia, to those of base_link"
                 )
 
@@ -260,7 +260,7 @@ class _Urdf:
         for part in path.split("/"):
             found = tag.findall(part)
             if len(found) > 1:
-                raise UserError(f"{self.name}: <{part}> of <{path}> is there {len(found)} times; leave one")
+                raise UserError(f"{self.name}: <{part}> of <{path}> occurs {len(found)} times; leave one")
             if not found:
                 return None
             tag = found[0]

@@ -28,7 +28,7 @@ def split_reference(reference: str) -> tuple[Path, str]:
     file, _, name = reference.rpartition(":")
     if not (file and name):
         file = reference.removesuffix(":")
-        raise UserError(f"{reference} names a file alone; give {file}:NAME, with the name of what the file defines")
+        raise UserError(f"{reference} names only a file; give {file}:NAME, with the name of an object in the file")
     return Path(file), name
 
 
@@ -51,7 +51,7 @@ def load(reference: str) -> Any:
 def definition(file: str, text: str, name: str) -> Any:
     """Object of a name in the text of a Python file; equal texts are executed once.
 
-    The code may import libraries, but no files beside it; `file` is its name in messages.
+    The code may import libraries, but not files in the same folder; `file` is its name in messages.
     """
     module = _executed(file, text)
     if name not in vars(module):
@@ -82,7 +82,7 @@ def _said(error: BaseException) -> str:
     """Type and message of an error, with a hint for errors of JAX."""
     kind = type(error).__name__
     if isinstance(error, SystemExit):
-        return f"{kind}({error.code!r}); a file of yours must not end the program"
+        return f"{kind}({error.code!r}); your file must not exit the program"
     message, _, more = str(error).strip().partition("\n")
     if isinstance(error, _OF_TRACING):
         return f"{kind}: {message}; JAX compiles this function: use jax.numpy, and jax.numpy.where in place of if"
@@ -101,7 +101,7 @@ def _executed(file: str, text: str) -> types.ModuleType:
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         not_found = isinstance(error, ImportError) and (error.name or "").partition(".")[0] not in sys.modules
-        alone = "; a file of yours may import libraries, but no files beside it" * not_found
+        alone = "; your file may import libraries, but not files in the same folder" * not_found
         if isinstance(error, SyntaxError) and error.filename == file:
             said = f"{file}: line {error.lineno} raises {type(error).__name__}: {error.msg}"
         else:  # text with a null byte is refused before any line of it

@@ -9,7 +9,7 @@ def test_more_memory_than_there_is_is_refused():
     held = limits.memory()
     assert held > 1e8
     limits.check_memory("a flight", held, "fly less")
-    with pytest.raises(ValueError, match=r"a flight needs about .* GB of memory, there are .* GB; fly less"):
+    with pytest.raises(ValueError, match=r"a flight needs about .* GB of memory, and there are .* GB; fly less"):
         limits.check_memory("a flight", held + 1, "fly less")
     with pytest.raises(ValueError, match="more than a million GB"):
         limits.check_memory("a flight", 10**400, "fly less")

@@ -91,7 +91,7 @@ def test_a_task_of_a_file_is_made_with_its_options(files):
 @pytest.mark.parametrize(
     ("reference", "text", "message"),
     [
-        ("my_task.py", "", r"my_task\.py names a file alone; give my_task\.py:NAME"),
+        ("my_task.py", "", r"my_task\.py names only a file; give my_task\.py:NAME"),
         ("my_task.py:", "", r"give my_task\.py:NAME"),
         ("missing.py:moving_box", "", r"missing\.py: cannot be read \(No such file or directory\)"),
         (
@@ -105,7 +105,7 @@ def test_a_task_of_a_file_is_made_with_its_options(files):
         (
             "my_task.py:f",
             "import helpers_of_mine",
-            r"ModuleNotFoundError: .*; a file of yours may import lib",
+            r"ModuleNotFoundError: .*; your file may import lib",
         ),
         ("my_task.py:f", "def f():\n    return 3", r"my_task\.py:f returned 3; return a jaxdrones\.tasks\.Task"),
         ("my_task.py:f", "def f(a: int = 3):\n    return a", r"got an unexpected keyword argument 'period'"),

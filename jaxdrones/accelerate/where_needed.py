@@ -32,8 +32,8 @@ def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | No
     """Build `(needed, *args, otherwise=None) -> function(*args)`, with `otherwise` or zeros where `needed` () is false.
 
     Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds, or of all worlds / `one_in`.
-    Derivatives are those of the function of arrays where it is needed, else those of `otherwise`, and cost as many
-    worlds; in reverse mode the function is recomputed.
+    Derivatives are those of the function of arrays where it is needed, else those of `otherwise`, and are computed only
+    in these worlds, too; in reverse mode the function is recomputed.
     """
 
     def where(needed: Array, *args: Any, otherwise: Any = None) -> Any:

@@ -8,7 +8,7 @@ cylinder. The normal force per mass at a penetration depth x that grows at the r
     s (a + b x') + c x,  s = x^2 / (d^2 + x^2),  and never negative.
 
 At the surface this is the law of Hunt and Crossley (1975): the damping grows from zero with the depth, so the force is
-continuous at touchdown and does not hold back a drone that leaves. Deeper inside the damping levels off, because
+continuous at touchdown and does not pull on a drone that takes off. Deeper inside the damping levels off, because
 explicit integration is unstable with more. Friction is Coulomb's, and viscous at low slip speed. All forces are
 proportional to a mass, so one set of coefficients serves every vehicle.
 
@@ -16,8 +16,8 @@ A velocity that is damped at a rate above 1/dt overshoots in explicit integratio
 energy. For every vehicle, heave, tilt and slip are each damped at no more than 408 1/s, 1.7 over `LARGEST_STEP`;
 `make_step` rejects longer steps. Coupled, the highest rate of a level drone is 275 1/s where it rests (hb: 334), and
 490 1/s at a depth of 2 cm (hb: 610, above 2/dt). That rate is friction's at rest, which falls as soon as the drone
-slips, so that the overshoot is a slip of the order of 1 cm/s. The price of such soft contact is depth: a drone that
-lands on the ground at 1 m/s sinks in 8 mm, at 5 m/s 3 cm.
+slips, so that the overshoot is a slip of the order of 1 cm/s. Such soft contact allows penetration: 8 mm for a drone
+that lands at 1 m/s, 3 cm at 5 m/s.
 """
 
 from typing import Any, NamedTuple

@@ -76,7 +76,7 @@ def _(at: tuple, change: tuple) -> tuple[Float[Array, ""], Float[Array, ""]]:
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:
     """Equation 6: a force along -z of the lower drone's body, independent of thrusts and attitudes.
 
-    The force of the equation diverges at zero height difference, and its width vanishes at 0.6875 m: the height
+    The force of the equation diverges at zero height difference, and its width vanishes at 0.6875 m, so the height
     difference is limited to at least 0.05 m and the width to at least 0.5 mm.
     """
     k1, k2, k3 = other.downwash_coeff

@@ -30,8 +30,8 @@ class PointMass(PyTreeNode):
 class Model:
     """Differential equation integrated with the rigid body; its state is `state.aux[name]`.
 
-    Every integrator treats it at its own order; Bullet takes explicit Euler steps, and semi-implicit ones of a
-    `PointMass`.
+    It is integrated with the order of the integrator; the Bullet backend uses explicit Euler, and semi-implicit Euler
+    for a `PointMass`.
     """
 
     name: str

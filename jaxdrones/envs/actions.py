@@ -1,4 +1,4 @@
-"""Action types: from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 is hover (but `throttle`)."""
+"""Action types: numbers in [-1, 1] to rotor speeds, scaled by the vehicle; 0 is hover, except for `throttle`."""
 
 from __future__ import annotations
 
@@ -181,8 +181,8 @@ def pid_gains() -> Action:
         if pid.fits(params):
             return Action(6, command, pid.init, entries=entries)
         raise UserError(
-            f"the action type 'pid_gains' scales the gains of the PID, which suit {', '.join(pid.VEHICLES)} and no "
-            "vehicle of other mass, inertia, arm or coefficients; take one of these, or another action type"
+            f"the action type 'pid_gains' scales the gains of the PID, which suit only {', '.join(pid.VEHICLES)} "
+                "and vehicles with similar parameters; give one of these, or another action type"
         )
 
     return Action(6, command, pid.init, for_vehicle, entries)

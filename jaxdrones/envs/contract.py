@@ -84,7 +84,7 @@ def _check_refusals(env: Env, key: jax.Array, world: Any) -> None:
             env.step(key, world, bad)
         except ValueError:
             continue
-        raise ContractError(f"an action with {why} is not refused")
+        raise ContractError(f"an action with {why} is not rejected")
 
 
 def _check_transformations(env: Env, keys: jax.Array, actions: jax.Array, flown: list) -> None:

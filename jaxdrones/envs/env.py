@@ -206,9 +206,9 @@ class Env:
 
         Returns:
             The observation; the world; the reward (n,); terminated (), whether the episode ended in a terminal state;
-            truncated (), whether it was cut; and info (n,): `rewards`, `metrics`, `terminations` and `truncations` by
-            name; `terminated` and `truncated`, whether the episode of each drone ended in this step; and `active`,
-            whether it had not ended before. After its end a drone has no reward; see `Task.ends`.
+            truncated (), whether it was cut off; and info (n,): `rewards`, `metrics`, `terminations` and `truncations`
+            by name; `terminated` and `truncated`, whether the episode of each drone ended in this step; and `active`,
+            whether it had not ended before. After its end the reward of a drone is zero; see `Task.ends`.
 
         Raises:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).

@@ -108,7 +108,7 @@ def _check_values(what: str, function: Callable, draw: Callable, check: Callable
         for i in range(_DRAWS):
             check(jax.tree.map(lambda x, i=i: x[i], drawn))
     except UserError as error:
-        raise UserError(f"{_where(what, function)} returns what cannot fly: {error}") from None
+        raise UserError(f"{_where(what, function)} returns values that cannot fly: {error}") from None
 
 
 def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:

@@ -226,7 +226,7 @@ REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
 )
 """Ranges of +-10 or 20 %, wider where published identifications of the Crazyflie differ more.
 
-Some find a fifth of our torque coefficient; some find that rotors slow down as fast as they speed up, others five times
-as slowly.
+Some find a fifth of the torque coefficient of `cf2x`; some find that rotors slow down as fast as they speed up, others
+five times as slowly.
 """
 REALISTIC_DELAY = 0.0, 0.04  # s, drawn: radio links and autopilots differ, and so do their loads

@@ -232,8 +232,8 @@ def _report(env: Env, outcomes: dict) -> Report:
 def _interval(success: np.ndarray, distinct: int) -> tuple[float, float]:
     """Confidence interval of the success (episodes, n) of drones, which are not independent within an episode.
 
-    An episode counts as many independent trials as the spread of its share of successes says: one if all its drones
-    share their fate, or if nothing failed, at most n.
+    The number of independent trials in an episode follows from the variance of its fraction of successes: 1 if all
+    drones of an episode succeed or fail together, or if none failed; at most n.
     """
     p, variance = np.mean(success), np.var(np.mean(success, axis=1))
     trials = np.clip(p * (1 - p) / variance, 1, success.shape[1]) if variance > 0 else 1

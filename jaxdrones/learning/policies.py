@@ -27,10 +27,10 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
     """Bundled or published policy, for `evaluate` and the functions of `learning.networks`.
 
     Args:
-        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or one for all
-            vehicles: `any-vehicle`, which was trained here, and `raptor`, which was published.
-        env: environment that the policy is to fly in, of which its observations and actions are checked. Optional for
-            a bundled policy, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
+        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or a policy for all vehicles:
+            `any-vehicle` (bundled) or `raptor` (published).
+        env: environment of the policy, whose observations and actions are checked. Optional for the bundled policy of
+            a task, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
 
     Raises:
         ValueError: an unknown name, or an environment with other observations or actions than the policy has.

@@ -34,7 +34,7 @@ _RATE_FACTOR = 1.2  # factor of an adaptation of the learning rate
 
 SMALLER = "try a smaller learning rate, for example learning_rate=1e-3"
 _NEVER_FINITE = (
-    "no update had finite ones, so the learning rate is not the cause: look in the task for NaN, very large rewards, "
+    "no update had finite gradients, so the learning rate is not the cause: look in the task for NaN, large rewards, "
     "and roots or norms of zero, whose gradient is not finite"
 )
 

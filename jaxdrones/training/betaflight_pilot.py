@@ -29,7 +29,7 @@ class PolicyPilot:
         """Start an episode of the task, whose only drone is the simulated one; `seed` is that of the goals."""
         if env.action.name != ACTION or env.action.entries is None:
             raise UserError(
-                f"the policy acts by {env.action.name!r}, for which Betaflight has no sticks; train one with "
+                f"the policy has the action type {env.action.name!r}, which sticks cannot command; train one with "
                 f"--set action={ACTION}"
             )
         if env.vision is not None or env.sensors or env.drones != 1:

@@ -1,4 +1,4 @@
-"""Flights of the policies that a training has kept, and its learning curve."""
+"""Flights of the policies in the history of a training, and its learning curve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Evaluated(NamedTuple):
     value: float
     """Success rate, or mean return of a task without success."""
     flight: EpisodeLog
-    """An episode; all begin alike."""
+    """An episode, with the same start for all policies."""
 
 
 def fly_history(run: Run, env: Env) -> list[Evaluated]:

@@ -55,8 +55,8 @@ def train(
 
     The folder of the run is prepared. The deadline is the end of the training, s on the clock of `time.perf_counter`;
     the number of updates then follows from the measured durations of updates and evaluations, and is at least one more.
-    Loggers are called with the metrics of every update. With `keep_history` the policies of all evaluations are kept; a
-    run that has kept some goes on.
+    Loggers are called with the metrics of every update. With `keep_history`, or if the
+    run has a history, the policies of all evaluations are kept.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so

@@ -17,7 +17,7 @@ _DELAYED_OBSERVATION = (*OBSERVED, "rotor_speed", last_actions(5))
 """Additional observations with rotor lag and a delay of up to four control steps."""
 
 _ANY_VEHICLE = {"action": "throttle", "observation": (*OBSERVED, last_actions(1))}
-"""Nothing that depends on the parameters of the vehicle."""
+"""Options that do not depend on the parameters of the vehicle."""
 
 _ONE_D = dict(worlds=64, horizon=120, updates=150, obs_stats_freeze=0.5, restart_fraction=0.3)
 _ONE_D_PPO = {
@@ -162,7 +162,7 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 """Options of the environment in training, where they differ from those in flight."""
 _REALISTIC_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
-    "hover": dict(delay=(0.0, 0.05)),  # s; in flight up to 40 ms, at which policies trained up to it oscillate
+    "hover": dict(delay=(0.0, 0.05)),  # s; up to 40 ms in flight, where policies trained with up to 40 ms oscillate
 }
 _REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
     "hover": dict(precision=1.0),  # without it drones settle a few centimeters away, or too late
@@ -189,9 +189,9 @@ def preset(
         algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
         realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters; the policy also
             observes rotor speeds and its last five actions. With `any`, every episode has a random vehicle, and the
-            policy observes its last action and commands `throttle`, which depend on no parameter of the vehicle.
-        practice: whether to make the environment of training, possibly with easier starts, or longer delays, than that
-            of flight.
+            policy observes its last action and commands `throttle`, independent of the parameters of the vehicle.
+        practice: whether to make the environment for training, which may have easier starts or longer delays than
+            that for flight.
         **options: options of `jaxdrones.make`.
     """
     config = learner(algorithm).Config()

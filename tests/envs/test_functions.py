@@ -63,9 +63,9 @@ def light(key, params):
 
 
 MISTAKES = [
-    (dict(start=turned(1.01)), "start returns what cannot fly: state.quat has length 1.01: .*; give a unit quaternion"),
-    (dict(start=turned(jnp.nan)), r"start returns what cannot fly: state.quat is not finite: "),
-    (dict(randomize=(light,)), r"a randomization returns what cannot fly: params.mass is -.*; give positive numbers"),
+    (dict(start=turned(1.01)), "start returns values that cannot fly: state.quat has length 1.01: .*; give a unit"),
+    (dict(start=turned(jnp.nan)), r"start returns values that cannot fly: state.quat is not finite: "),
+    (dict(randomize=(light,)), r"a randomization returns values that cannot fly: params.mass is -.*; give positive"),
     (dict(start=of_whole_numbers), "start returns a state whose pos is .*int.*; give an array .* of float"),
     (dict(equip=lambda params: None), "equip returns None; return params.replace"),
     (dict(equip=lambda params: params.replace(mass=jnp.ones(7))), r"equip returns .* mass is an array \(7,\)"),
@@ -95,7 +95,7 @@ def test_what_a_function_of_a_task_returns_is_refused_where_nothing_can_be_flown
 @pytest.mark.parametrize(
     ("randomization", "said"),
     [
-        (light, r"test_functions.py, line \d+: a randomization returns what cannot fly: params.mass is -"),
+        (light, r"test_functions.py, line \d+: a randomization returns values that cannot fly: params.mass is -"),
         (lambda key, params: params.mass, r"a randomization returns .*; return params.replace"),
         (
             shifted("inertia", -2e-5, 1e-5),

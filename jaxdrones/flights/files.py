@@ -48,7 +48,7 @@ def find_log(path: str | os.PathLike) -> Path:
         return path
     found = [log for log in (path / "log.npz", path / "flight" / "log.npz") if log.is_file()]
     if not found:
-        what = "has no log of a flight" if path.is_dir() else "is not there"
+        what = "has no log of a flight" if path.is_dir() else "does not exist"
         raise UserError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
     return found[0]
 
@@ -191,12 +191,12 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
                 message = store.deserialize_cdr(data, connection.msgtype)
                 found.setdefault(connection.topic.strip("/"), {})[ns] = message
     except Exception as error:  # the reader raises errors of any type on damaged bytes
-        raise UserError(f"{path} is no bag of ROS 2, or is damaged: {error}; give the folder of a sound one") from None
+        raise UserError(f"{path} is not a ROS 2 bag, or is damaged: {error}; give the folder of a bag") from None
     n = 0
     while {f"drone_{n}/odom", f"drone_{n}/motors"} <= found.keys():
         n += 1
     if not n:
-        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom or /drone_0/motors; record it with both")
+        raise UserError(f"{path} has no flight: /drone_0/odom or /drone_0/motors is missing; record both")
     times = sorted(set.intersection(*(set(found[f"drone_{i}/{kind}"]) for i in range(n) for kind in kinds.values())))
     if not times:
         raise UserError(
@@ -268,8 +268,8 @@ def _check(log: FlightLog) -> None:
     if (np.abs(length - 1) > _MAX_STRETCH).any():
         row, drone = np.argwhere(np.abs(length - 1) > _MAX_STRETCH)[0].tolist()
         raise UserError(
-            f"{log.name}: quat of {log.labels[drone]} has a length of {length[row, drone]:.4g} in row {row}, which "
-            "looks like no unit quaternion; give x, y, z, w"
+            f"{log.name}: quat of {log.labels[drone]} has a length of {length[row, drone]:.4g} in row {row}, but "
+            "a unit quaternion has a length of 1; give x, y, z, w"
         )
     n = len(log.labels)
     for field, x in vars(log.params).items():

@@ -108,7 +108,7 @@ def climb_correlation(pos: np.ndarray, vel: np.ndarray) -> float:
 def delay_of(pos: np.ndarray, vel: np.ndarray) -> tuple[float, float]:
     """Delay of the velocity against the position, s, and the share of the misfit of `shift_test` that it explains.
 
-    It is that of the least squares to first order, and so too small for long delays.
+    It is a least-squares estimate to first order, which is too small for long delays.
     """
     test, (starts, _) = shift_test(pos, vel), _path(pos, vel)
     if not test.observable:

@@ -152,7 +152,7 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
     largest = np.max(np.abs(x))
     if column == "quat":
         length = np.linalg.norm(x, axis=-1)
-        require(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {length[0, 0]:.4g})", "x, y, z, w")
+        require(np.all(np.abs(length - 1) < 0.05), f"quaternions of length {length[0, 0]:.4g}, not 1", "x, y, z, w")
     elif column == "omega":
         require(largest <= _MAX_RATE, "degrees/s", "rad/s")
     elif column == "target_yaw":
@@ -163,10 +163,10 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
         require(largest <= 1e4, "mm", "m")
     elif column == "vbat":
         require(largest <= _MAX_VOLTAGE, "millivolts", "V")
-        require(np.min(x) >= _MIN_VOLTAGE, "no voltage that turns motors", "V")
+        require(np.min(x) >= _MIN_VOLTAGE, "a voltage too low for motors", "V")
     elif column == "pwm":
-        require(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
+        require(0 <= np.min(x) and largest <= _FULL_PWM, "numbers beyond 16-bit duty cycles", "0 to 65535")
         require(largest > _MIN_PEAK_PWM, "percent, 8 bits or microseconds", "0 to 65535")
     elif column == "rpm":
-        require(0 <= np.min(x) and largest <= _MAX_RPM, "no rotor speed", "RPM")
+        require(0 <= np.min(x) and largest <= _MAX_RPM, "numbers beyond rotor speeds", "RPM")
         require(np.median(x) >= _MIN_MEDIAN_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

@@ -51,7 +51,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
 
         path = Path(path)
         if path.exists():
-            raise UserError(f"{path} exists already; name a bag that does not")
+            raise UserError(f"{path} exists already; give the path of a new bag")
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Any] = {}
         try:
@@ -86,7 +86,7 @@ def read(path: Path) -> Iterator[Recorded]:
             for connection, ns, data in reader.messages(known):
                 yield Recorded(connection.topic.removeprefix("/"), ns, deserialize(data, connection.msgtype))
     except Exception as error:  # the reader raises errors of any type on damaged bytes
-        raise UserError(f"{path} is no bag of ROS 2, or is damaged: {error}; give the folder of a sound one") from None
+        raise UserError(f"{path} is not a ROS 2 bag, or is damaged: {error}; give the folder of a bag") from None
 
 
 def write_flight(record: FlightLog, path: Path) -> None:

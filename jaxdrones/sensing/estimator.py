@@ -74,9 +74,9 @@ def state_estimate(
 
     The filter, `jaxdrones.sensing.kalman`, fuses an IMU at the center of mass with motion capture. The IMU integrates
     over its period, as in flight controllers. Poses arrive late: the filter updates at their instant, and the IMU's
-    samples since then propagate its estimate to the present.
-    The reading's `rpm` is that of the drone, as in telemetry, and its `aux` is empty. The memory's `estimate` has the
-    covariance. The filter does not model scale errors, saturation, or colored noise of poses.
+    samples since then propagate its estimate to the present. The reading's `rpm` is that of the drone, as in telemetry,
+    and its `aux` is empty. The memory's `estimate` has the covariance. The filter does not model scale errors,
+    saturation, or colored noise of poses.
 
     Args:
         part: errors of the IMU.
@@ -162,7 +162,7 @@ def state_estimate(
 def seen(now: kalman.Estimate, state: State, read: dict[str, Array], true: dict[str, Array]) -> State:
     """Estimated state; body rates are those of the gyroscope, less its estimated bias.
 
-    The error of the reading, of a mean over the period, is taken for that at the instant.
+    The error of the reading, which is a mean over the period, is used as that at the instant.
     """
     omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
     return State(now.pos, now.quat, now.vel, omega, state.rpm)

@@ -55,7 +55,7 @@ def render(scene: AnalyticScene, params: Params, state: TeamState, camera: OneCa
     than `near` are seen at `near`, also from inside. Under `jax.jit` unused images cost nothing.
 
     Raises:
-        ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
+        ValueError: a wrong shape, an argument that is not a camera, or a mesh or URDF file in the scene.
     """
     _check_team(params, state)
     return _render(scene, params, state, camera)

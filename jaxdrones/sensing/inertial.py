@@ -40,13 +40,13 @@ BMI088 = ImuPart(
 )
 """Of the Crazyflie 2.1, at the ranges of its firmware (24 g, 2000 degrees/s): Bosch BST-BMI088-DS001 gives 175 ug and
 0.014 degrees/s per sqrt(Hz), offsets of +-20 mg and +-1 degree/s, used as standard deviations, and a gyroscope stable
-to 2 degrees/h, whose correlation time of 100 s is assumed. It is silent on the stability of the accelerometer."""
+to 2 degrees/h, whose correlation time of 100 s is assumed. It does not state the stability of the accelerometer."""
 MPU9250 = ImuPart(
     acc=Noise(density=300e-6 * STANDARD_GRAVITY, turn_on=60e-3 * STANDARD_GRAVITY, limit=16 * STANDARD_GRAVITY),
     gyro=Noise(density=0.01 * _DEGREE, turn_on=5 * _DEGREE, limit=2000 * _DEGREE),
 )
 """Of the Crazyflie 2.0, at 16 g and 2000 degrees/s: InvenSense PS-MPU-9250A-01 gives 300 ug and 0.01 degrees/s per
-sqrt(Hz) and offsets of +-60 mg and +-5 degrees/s, used as standard deviations. It is silent on their stability."""
+sqrt(Hz) and offsets of +-60 mg and +-5 degrees/s, used as standard deviations. It does not state their stability."""
 
 
 def imu(

@@ -68,7 +68,7 @@ def predict(
     Args:
         noise: of the IMU.
         estimate: at the start of the step.
-        gyro: mean reading in the step, rad/s, body; the mean of the readings at its start and end will do.
+        gyro: mean reading in the step, rad/s, body, or approximately the mean of the readings at its start and end.
         acc: mean reading in the step, specific force, m/s^2, in the body axes of mid-step.
         gravity: m/s^2.
         dt: time step, s.

@@ -47,7 +47,7 @@ class Noise:
     density: float = 0.0
     """White noise, u/sqrt(Hz): its Allan deviation over t seconds is density / sqrt(t)."""
     instability: float = 0.0
-    """Bias instability B, u: the Allan deviation of the bias is at most 0.664 B, which it is at 1.89 `correlation`."""
+    """Bias instability B, u: the Allan deviation of the bias is at most 0.664 B, at a time of 1.89 `correlation`."""
     correlation: float = 100.0
     """Correlation time of the Gauss-Markov process of the bias instability, s."""
     random_walk: float = 0.0

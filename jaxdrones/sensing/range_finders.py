@@ -1,7 +1,7 @@
 """Ray casts, range finders and optical flow; other drones are invisible to them.
 
-The defaults are the rates and ranges of the named devices, without noise: data sheets give it for one surface and one
-light only.
+The defaults are the rates and ranges of the named devices, without noise, which data sheets give only for one surface
+and one illumination.
 """
 
 import math

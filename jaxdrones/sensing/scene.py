@@ -41,8 +41,8 @@ class Scene(PyTreeNode, kw_only=True):
     """Static obstacles, and by default a ground plane at z = 0. `Scene.of` builds one.
 
     Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind in the
-    order of the arguments. Distances and surfaces are of points (3,), m, world, for many of which use `jax.vmap`; they
-    are differentiable in point and scene, and `ValueError` is raised for meshes and URDF files.
+    order of the arguments. Queries of distances and surfaces take one point (3,), m, world; use `jax.vmap` for many.
+    They are differentiable in point and scene, and raise `ValueError` for meshes and URDF files.
     """
 
     boxes: Box | None = None
@@ -72,7 +72,7 @@ class Scene(PyTreeNode, kw_only=True):
             ground: whether there is a ground plane at z = 0.
 
         Raises:
-            ValueError: something else than an obstacle, or one of a wrong shape or size.
+            ValueError: an argument that is not an obstacle, or one of a wrong shape or size.
         """
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle | File):
@@ -146,7 +146,7 @@ class Scene(PyTreeNode, kw_only=True):
         """
         shapes = self._analytic(points.dtype)
         if not shapes:
-            raise UserError("the scene has no obstacles that could be touched; check scene.has_obstacles first")
+            raise UserError("the scene has no obstacles; check scene.has_obstacles first")
         (obstacles,) = merged(shapes)
         return touched_of(obstacles, points, within)
 

@@ -145,8 +145,8 @@ def hold_between(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Hold memories and readings between the measurements of sensors with their own rates.
 
-    `step` counts control steps of `dt` (s) since the start of the episode. Without readings `before`, every sensor
-    measures; `after` is what it then has.
+    `step` counts control steps of `dt` (s) since the start of the episode. `after` has the memories and readings of a
+    measurement; without readings `before`, all of them are used.
     """
     if not before[1]:
         return after

@@ -47,7 +47,7 @@ def from_urdf(
     try:
         robot = ET.parse(file).getroot()
     except ET.ParseError as error:
-        raise UserError(f"{file}: it is no XML ({error}); give a URDF") from None
+        raise UserError(f"{file}: it is not XML ({error}); give a URDF") from None
     links = {link.get("name", ""): link for link in robot.findall("link")}
     if not links:
         raise UserError(f"{file}: it has no <link>; give a URDF")
@@ -76,7 +76,7 @@ def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: P
         joints[ends[1]] = (ends[0], _pose(file, joint))
     roots = links.keys() - joints.keys()
     if len(roots) != 1:
-        raise UserError(f"{file}: {len(roots)} links are no child of a joint; give a tree with one root")
+        raise UserError(f"{file}: {len(roots)} links are not the child of a joint; give a tree with one root")
     places = dict.fromkeys(roots, root)
     while joints:
         ready = [child for child, (parent, _) in joints.items() if parent in places]

@@ -46,8 +46,8 @@ def crowd(
         drones: number of drones, at least two.
         density: drones per volume of the cube.
         obstacles: balls per volume of the cube.
-        random_box: whether the sides are drawn for every episode: 0.6 to 1.1 times those of the cube, in every second
-            box with one side up to twice as long, in which drones meet at full speed. Meant for training.
+        random_box: for training: sides drawn for every episode, 0.6 to 1.1 times those of the cube; in half of the
+            episodes one side is up to twice as long, so that drones meet at full speed.
         patience: duration of an episode over that of a straight flight along the diagonal plus 6 s.
     """
     side = (drones / density) ** (1 / 3)

@@ -42,8 +42,8 @@ def gates(
 ) -> Task:
     """One lap through four gates.
 
-    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, with collisions by
-    `sensing.collisions`. A scene of your own has to begin with four gates, as from `sensing.track`.
+    Gates and poles are obstacles of the scene, visible in camera images; touching one ends the episode. Your own scene
+    must begin with four gates, as from `sensing.track`.
 
     Args:
         drones: number of drones, at most 5; they start 0.5 m apart in y and do not observe each other.

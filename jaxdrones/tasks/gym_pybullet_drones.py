@@ -1,6 +1,6 @@
 """Tasks of gym-pybullet-drones (2021), and those of version 2.x (`hover_2x`, `multi_hover`).
 
-Rewards, terminations, truncations and starts are those of gym-pybullet-drones. It reads its clock before the step:
+Rewards, terminations, truncations and starts are those of gym-pybullet-drones, which reads the time before a step:
 rewards for a moving target lag one control step behind, and an episode of T seconds has two steps more than T / dt.
 
 gym-pybullet-drones has no criteria of success and one fixed start for each task. With `start_spread` (m, at most 0.5)
@@ -111,15 +111,15 @@ def leader_follower(drones: Team = 2, start_spread: float = 0.0) -> Task:
 
 @checked
 def flock(drones: Team = 2, start_spread: float = 0.0) -> Task:
-    """First drone hovers at (0, 0, 1); every other one matches the height of the one before it."""
+    """First drone hovers at (0, 0, 1); every other one matches the height of the previous one."""
 
     def cost(target, world):
-        """First drone: squared distance from its target, m^2; others: squared height over the drone before, m^2."""
+        """First drone: squared distance from its target, m^2; others: squared height over the previous drone, m^2."""
         pos = world.drones.pos
         follower = (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2
         return follower.at[0].set(_squared_distance(target, world)[0])
 
-    summary = "fly at the height of the drone before"
+    summary = "fly at the height of the previous drone"
     return _task_2021("flock", summary, drones, start_spread, _at_height(1.0), cost)
 
 
@@ -153,7 +153,7 @@ def multi_hover(drones: int = 2, start_spread: float = 0.0) -> Task:
         """Above the start of the drone, the first one highest."""
         return Setpoint.at(starts.at[:, 2].add(1 / (1 + jnp.arange(len(starts), dtype=starts.dtype))))
 
-    summary = "every drone hovers at a height of its own"
+    summary = "every drone hovers at a different height"
     return _task_2x("multi-hover", summary, drones, start_spread, target, 2.0, _close_at_the_end)
 
 

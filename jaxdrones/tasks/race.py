@@ -51,7 +51,7 @@ def race(
     contact: Switch = True,
     acceleration: Annotated[float, number("m/s^2", above=0)] = 12.0,
 ) -> Task:
-    """Drones race through four gates; they fly in each other's downwash, and touch.
+    """Drones race through four gates, in each other's downwash and with contact.
 
     Each drone's episode ends when it passes its last gate, hits an obstacle or is out of control; then it leaves the
     world. Drones touch when their centers come closer than two collision radii.
@@ -63,8 +63,8 @@ def race(
         laps: number of laps of four gates.
         random_start: for training: start in flight at a random place of the track with probability 0.8, one behind
             the other, else on the ground at the start.
-        contact: whether ground and drones push a drone, gates and poles end its race, and only the opening of a gate
-            counts. Training goes without: it needs fewer physics steps, and drones learn from whole flights.
+        contact: whether there are contact forces of ground and drones, gates and poles end a race, and only flights
+            through the opening of a gate count. Training disables it: fewer physics steps, and longer episodes.
         acceleration: largest acceleration of the observed desired velocity, along the centerline and across it, m/s^2.
     """
     scene, total = racetrack.scene_of(level), laps * len(GATES)
@@ -135,7 +135,7 @@ def race(
         start=start,
         target=racetrack.target,
         rewards={
-            "progress": (10.0, shaping.variable("progress", "Way along the centerline in the last step, m.")),
+            "progress": (10.0, shaping.variable("progress", "Distance along the centerline in the last step, m.")),
             "velocity": (-1.0, _velocity),
             "passed": (2.0, racetrack.passed),
             "crashed": (-10.0, racetrack.crash),

@@ -76,7 +76,7 @@ def room(
         start=start,
         target=shaping.goal,
         rewards=crossing.REWARDS_AMONG_OBSTACLES | {"touched": (-10.0, touching.METRICS["touched"])},
-        terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
+        terminations={"touched": shaping.flag("touched", "A drone touches a surface of the room or a drone.")}
         | shaping.out_of_control(size, center=(0, 0, HEIGHT)),
         advance=touching.advance,
         metrics=touching.METRICS,

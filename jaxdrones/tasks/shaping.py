@@ -82,7 +82,7 @@ def clearance(margin_time: float = 0.1) -> Term:
     """Term of the smoothed penetration of the margin around obstacles and ground, m.
 
     Margin and term grow with the closing speed, as in the cost of DiffPhysDrone ("Back to Newton's laws", 2024): a
-    drone needs more distance the faster it approaches an obstacle, and none beside it.
+    drone needs more distance the faster it approaches an obstacle, and none if it flies past it.
 
     `margin_time` is the growth of the margin with the closing speed, s.
     """

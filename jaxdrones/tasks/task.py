@@ -139,7 +139,7 @@ class Task:
     truncations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
     """Name -> condition that truncates the episode."""
     ends: Annotated[str, arguments.choice("ends", ("team", "drone"))] = "team"
-    """Whose episode a condition ends: that of the `team`, or of the `drone` alone, which leaves the world while the
+    """Episode that a condition ends: that of the `team`, or that of one `drone`, which leaves the world while the
     others continue."""
     advance: Callable[[Task, World], Any] = lambda task, world: world.variables
     """(task, world after a step with the variables before it) -> variables of the task after the step."""
@@ -147,11 +147,11 @@ class Task:
     """Reported quantities without reward, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
     """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
-    after the end of an episode. An episode that ends by a failure is no success. With `ends="team"` a success is one of
-    all drones."""
+    after the end of an episode. An episode that ends with a failure is not a success. With `ends="team"` all drones
+    must succeed."""
     success_terminations: Annotated[tuple[str, ...], arguments.sequence("'reached'")] = ()
-    """Names of the terminations that are no failure, such as a reached goal. Every other termination, and every
-    truncation but that of the time, is a failure."""
+    """Names of the terminations that are not failures, such as a reached goal. All other terminations, and all
+    truncations except the time limit, are failures."""
     observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
     """Observation terms of this task by name."""
     randomize: Annotated[tuple[Randomization, ...], arguments.sequence("scaled('mass', 0.9, 1.1)")] = ()
@@ -183,7 +183,7 @@ class Task:
     observation: Annotated[tuple[str, ...], arguments.sequence("'position_error'")] = _OBSERVATION
     """Names of the default observation terms."""
     extra_steps: arguments.NonNegativeInt = 0
-    """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
+    """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which checks the time before a step."""
 
     def __post_init__(self):
         kinds = {"name": str, "summary": str, "camera": Camera | None}
@@ -246,7 +246,7 @@ class Task:
         return self.shared(jnp.all, succeeded)
 
     def shared(self, reduce: Callable[[Array], Array], x: Bool[Array, " n"]) -> Bool[Array, " n"]:
-        """The reduction of x for all drones with `ends="team"`, else x."""
+        """With `ends="team"` the reduction of x over the drones, repeated for each of them; else x."""
         return jnp.broadcast_to(reduce(x), x.shape) if self.ends == "team" else x
 
     def target_now(self, world: World) -> Setpoint:

@@ -121,7 +121,7 @@ def test_a_battery_that_is_charged_by_its_load_is_refused(tmp_path, columns_of):
     sound = columns_of(load_flights("B3_figure8_slow_rep2")[0])
     with pytest.raises(ValueError, match="the load of the battery has the wrong sign"):
         load(tmp_path, others(sound, vbat=lambda v: 2 * v.max() - v))
-    with pytest.raises(ValueError, match=r"vbat is -4\.\d+ to -3\.\d+, which looks like no voltage"):
+    with pytest.raises(ValueError, match=r"vbat is -4\.\d+ to -3\.\d+, which looks like a voltage too low"):
         load(tmp_path, others(sound, vbat=np.negative))
 
 

@@ -44,11 +44,11 @@ def test_a_log_is_read_as_it_was_written(columns, tmp_path):
         (lambda c: c.update(pwm=1000 + c.pop("rpm") / 20, vbat=np.full(300, 3.7)), "pwm .* microseconds"),
         (
             lambda c: c.update(quat=c["quat"] * (np.arange(300) != 9)[:, None]),
-            "length of 0 in row 9, .*no unit quaternion",
+            "length of 0 in row 9, but a unit quaternion",
         ),
         (lambda c: c.update(labels=np.array(["a", "b"])), "has 300 times, 1 drones and 2 labels"),
         (lambda c: c.update(pwm=c.pop("rpm"), vbat=np.full(300, 3700.0)), "vbat .* looks like millivolts"),
-        (lambda c: c.update(quat=c["quat"] * 2), "looks like no unit quaternion"),
+        (lambda c: c.update(quat=c["quat"] * 2), "has a length of 2 in row 0, but a unit quaternion"),
         (lambda c: c.update({k: v[:50] for k, v in c.items()}), "has 50 rows, 0.49 s; give at least one second"),
         (
             lambda c: c.update(pos=c["pos"][:, :2]),
@@ -66,7 +66,7 @@ def test_what_is_no_file_of_arrays_is_named(tmp_path):
     (tmp_path / "text.npz").write_text("t, pos")
     with pytest.raises(ValueError, match=r"is not an \.npz file"):
         read_log(tmp_path / "text.npz")
-    with pytest.raises(ValueError, match="is not there; fly first"):
+    with pytest.raises(ValueError, match="does not exist; fly first"):
         read_log(tmp_path / "missing.npz")
 
 

@@ -78,12 +78,12 @@ def test_a_flight_comes_back_from_its_bag(tmp_path):
 
 @pytest.mark.slow
 def test_a_bag_is_not_written_over(recorded):
-    with pytest.raises(ValueError, match="exists already; name a bag that does not"):
+    with pytest.raises(ValueError, match="exists already; give the path of a new bag"):
         bag.Recorder(recorded[0])
 
 
 def test_what_is_no_bag_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="is no bag of ROS 2"):
+    with pytest.raises(ValueError, match="is not a ROS 2 bag"):
         list(bag.read(tmp_path / "nothing"))
 
 
@@ -103,7 +103,7 @@ def test_a_damaged_bag_is_refused(tmp_path):
         try:
             list(bag.read(tmp_path / "bag"))
         except ValueError as error:
-            assert "is no bag of ROS 2, or is damaged" in str(error)
+            assert "is not a ROS 2 bag, or is damaged" in str(error)
             refused += 1
     assert refused >= 7
 
@@ -111,7 +111,7 @@ def test_a_damaged_bag_is_refused(tmp_path):
 def test_a_bag_without_a_flight_is_refused(tmp_path):
     with bag.Recorder(tmp_path / "bag") as recorder:
         recorder.write(topics.CLOCK, msg.Clock(convert.stamp(5)), 5)
-    with pytest.raises(ValueError, match="holds no flight"):
+    with pytest.raises(ValueError, match="has no flight"):
         read_log(tmp_path / "bag")
 
 

@@ -59,7 +59,7 @@ def test_a_landing_is_reported_as_json(wire, capsys):
         (["--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["--controller", "none"], "unknown controller 'none'"),
         (["--lockstep", "--real-time"], "not allowed with"),
-        (["replay", "nothing"], "nothing is no bag of ROS 2"),
+        (["replay", "nothing"], "nothing is not a ROS 2 bag"),
         (["--lockstep", "replay", "nothing"], "--lockstep is an option of flights"),
     ],
 )

@@ -208,7 +208,7 @@ def test_a_scene_from_a_urdf_has_its_shapes_where_its_links_are(tmp_path):
         ('scale="2 2 2"', 'scale="2 2 1"', "give the same number along each axis"),
         ('child link="tip"', 'child link="nose"', "joint 'j' connects .*nose"),
         ('parent link="base"', 'parent link="tip"', "circle of tip"),
-        ("</robot>", "", "it is no XML"),
+        ("</robot>", "", "it is not XML"),
         ("a.obj", "b.obj", r"b\.obj: there is no such file"),
     ],
 )

@@ -177,7 +177,7 @@ def test_the_page_was_built_from_its_sources():
         (lambda path: jax.tree.map(lambda x: x[0], path), {"params": "team", "dt": 0.01}, r"shape \(3, 3\)"),
         (lambda path: 3, {}, "3 cannot be shown"),
         (lambda path: [], {}, "give at least one"),
-        (lambda path: "nowhere/log.npz", {}, "nowhere/log.npz is not there; fly first"),
+        (lambda path: "nowhere/log.npz", {}, "nowhere/log.npz does not exist; fly first"),
         (lambda path: __file__, {}, r"is not an \.npz file"),
     ],
 )
@@ -255,7 +255,7 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
     (tmp_path / "damaged.npz").write_bytes(whole[:2000])
     (tmp_path / "directory.npz").write_bytes(whole.replace(b"PK\x01\x02", b"PK\x01\x03"))  # of the archive, at its end
     for others, message in (
-        (["nowhere"], "nowhere is not there"),
+        (["nowhere"], "nowhere does not exist"),
         (["damaged.npz"], "damaged.npz: is not an .npz file"),
         (["directory.npz"], "directory.npz: is not an .npz file"),
     ):

@@ -28,12 +28,12 @@ class Failsafe:
     """Timeouts of commands, and action after them."""
 
     action: Annotated[str, choice("failsafe", ACTIONS)] = "hover"
-    """`hover`: hold the last commanded position, or else the present one. `land`: sink to the ground there and stop the
-    rotors. `stop`: end the flight with an error."""
+    """`hover`: hold the last commanded position, or else the current one. `land`: descend to the ground there and stop
+    the rotors. `stop`: end the flight with an error."""
     timeout: Seconds = 1.0
     """Seconds without a command before the failsafe acts."""
     wait: Seconds = 30.0
-    """The same before the first command."""
+    """Seconds without a first command before the failsafe acts."""
 
 
 class Watch:

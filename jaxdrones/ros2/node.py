@@ -64,8 +64,8 @@ class Node:
             simulation: team in flight.
             transport: transport of messages, closed by the caller.
             lockstep: whether the flight waits for the step service.
-            failsafe: action without commands. Commands are a stream, to be repeated within the timeout. In lockstep the
-                timeout is that of the step service.
+            failsafe: action without commands, which must be repeated within the timeout. In lockstep the timeout is
+                    that of the step service.
             speed: real-time factor.
             camera: on every drone, at its `rate` or every control step; by default no images.
             recorder: recorder of all messages.
@@ -135,7 +135,7 @@ class Node:
         self.flown.received += 1
         self._flight.commands[i] = command
         if self._watches[i].hear(self._clock()) and not self._lockstep:
-            self._warn(f"commands for {topics.drone(i)} are back; it flies them")
+            self._warn(f"commands for {topics.drone(i)} arrive; it follows them")
 
     def _answer(self) -> tuple[bool, str]:
         """Step service: one control step; the answer has the simulated time."""

@@ -134,7 +134,7 @@ def ros_class(kind: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError as error:
-        raise ImportError(f"{kind} is not there; install the ROS 2 package {package}") from error
+        raise ImportError(f"{kind} is not installed; install the ROS 2 package {package}") from error
 
 
 def to_ros(message: msg.Message) -> Any:

@@ -22,13 +22,13 @@ from jaxdrones.sensing import Camera, Scene, render
 from jaxdrones.state import State
 
 Battery = Callable[[Params, State], dict[str, Any]]
-"""(params, state) of one drone -> `voltage` V, `current` A drawn, `charge` and `capacity` A s; any of them may lack."""
+"""(params, state) of one drone -> `voltage` V, `current` A drawn, `charge` and `capacity` A s; any may be missing."""
 
 _SECOND = 1_000_000_000  # ns
 
 
 class Simulation:
-    """Team and its engine; `advance` takes one control step."""
+    """Team and its step; `advance` takes one control step."""
 
     def __init__(
         self,
@@ -98,9 +98,9 @@ class Simulation:
         return self._control(self.params, self._memory, self.state, team)
 
     def measure(self) -> Measurement:
-        """Published data of the team at present.
+        """Current published data of the team.
 
-        Accelerometers measure the derivative of the engine with the last commanded rotor speeds.
+        Accelerometers measure the acceleration under the last commanded rotor speeds.
         """
         acc = self._step.rate(self.params, self.state, self._rpm, self._scene).vel
         return jax.device_get(self._measure(self.params, self.state, acc, self._battery))

@@ -11,7 +11,7 @@ import dataclasses
 WORLD = "world"
 """Frame of positions."""
 STEP_SERVICE = "step"
-"""`std_srvs/srv/Trigger`: advance the flight by one control step and answer when its messages are out."""
+"""`std_srvs/srv/Trigger`: advance the flight by one control step and answer when its messages are published."""
 
 
 @dataclasses.dataclass(frozen=True)

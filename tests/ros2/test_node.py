@@ -117,7 +117,7 @@ def test_a_peer_that_comes_back_is_heard():
     peer = Peer(wire, 1)
     wire.script = [(1.0, lambda: peer.fly_to([[0.2, 0.0, 1.0]]))]
     node.run(1.1)
-    assert warnings == ["no command for drone_0 for 0.2 s; it hovers", "commands for drone_0 are back; it flies them"]
+    assert warnings == ["no command for drone_0 for 0.2 s; it hovers", "commands for drone_0 arrive; it follows them"]
 
 
 @pytest.mark.slow

@@ -264,7 +264,7 @@ def test_a_late_peer_is_heard_and_a_wrong_type_is_named(join, start):
     assert out["received"] == sent
     for line in (
         "no command for drone_0 for 0.5 s; it hovers",
-        "commands for drone_0 are back",
+        "commands for drone_0 arrive",
         "publishes /drone_0/cmd_rates as geometry_msgs/msg/TwistStamped; its type is geometry_msgs/msg/Twist",
     ):
         assert line in err

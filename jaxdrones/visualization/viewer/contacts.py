@@ -23,8 +23,8 @@ _ANGLES = np.arange(8) * np.pi / 4
 def contact_forces(log: FlightLog) -> np.ndarray | None:
     """(K, n, 3) forces of the ground, of obstacles and of other drones on drones, N, world; `None` if there are none.
 
-    A force is what thrust and weight lack to the mass times the acceleration, by differences of the logged velocities.
-    It is zero where the collision shape of the drone touches nothing.
+    A force is the mass times the acceleration, from differences of the logged velocities, less thrust and weight. It is
+    zero where the collision shape of the drone touches nothing.
     """
     scene = only_shapes(log.scene)
     team = len(log.labels) > 1

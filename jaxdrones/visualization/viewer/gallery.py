@@ -19,7 +19,7 @@ class Exhibit:
     name: str
     """Title, and the part of the address after #."""
     about: str
-    """What is flown, and how well: a few sentences."""
+    """Description of the flight and of its success, a few sentences."""
     command: str
     """Command that flies it."""
     payload: str
@@ -27,7 +27,7 @@ class Exhibit:
 
 
 def gallery(exhibits: Sequence[Exhibit]) -> str:
-    """HTML text of a page, self-contained, that shows the first flight at first."""
+    """HTML text of a self-contained page that begins with the first flight."""
     data = {"player": template(), "exhibits": [dataclasses.asdict(exhibit) for exhibit in exhibits]}
     return _TEMPLATE.read_text(encoding="utf-8").replace("@DATA@", json.dumps(data).replace("<", "\\u003c"))
 

@@ -56,6 +56,6 @@ def template() -> str:
         return _TEMPLATE.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ImportError(
-            f"the viewer's page is not built: {_TEMPLATE} is not there; run `make viewer` in the sources, which needs "
+            f"the viewer's page is not built: {_TEMPLATE} is missing; run `make viewer` in the sources, which needs "
             "npm, or install the wheel"
         ) from None

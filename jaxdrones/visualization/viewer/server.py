@@ -109,7 +109,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
         self.request.settimeout(_STUCK)
         path = self.server.path
         if not self._is_own():
-            return self.send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
+            return self.send_error(HTTPStatus.FORBIDDEN, "this page is available only on this machine")
         if not secrets.compare_digest(self.path.encode()[: len(path)], path.encode()):
             return self.send_error(HTTPStatus.FORBIDDEN, "open the whole address that was printed")
         if self.path == path:

@@ -58,7 +58,7 @@ class VectorEnv(BaseVectorEnv):
         raise UserError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
 
     def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:
-        """Seed all episodes of every world: of the first world, incremented for the others; one for each; or `None`."""
+        """Seed the worlds: with the seed of the first world, incremented for the others; one seed each; or `None`."""
         if seed is None:
             seed = int(np.random.default_rng().integers(SEEDS))
         seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int | np.integer) else list(seed)
@@ -75,7 +75,7 @@ class VectorEnv(BaseVectorEnv):
             self.seed(seed)
         mask = self._mask(env_id)
         if not (mask.all() or self._worlds.started):
-            raise UserError("some worlds are reset before all were; call reset() first")
+            raise UserError("some worlds are reset before the first reset of all worlds; call reset() first")
         seeds = [rng.integers(SEEDS) if chosen else 0 for rng, chosen in zip(self._seeds, mask, strict=True)]
         obs = self._worlds.reset(np.array(seeds, np.uint32), None if mask.all() else mask)
         chosen = self._ids(env_id)

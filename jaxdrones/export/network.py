@@ -1,4 +1,4 @@
-"""Layers of a policy: the only knowledge of its network that the targets have."""
+"""Layers of a policy, the common input of all targets except StableHLO."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -115,7 +115,7 @@ def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
     action = built.activation(built.mlp(x, network, params), "tanh")
     graph = Graph(inputs, tuple(built.layers), action, next_hidden_state)
     if graph.weights - 2 * obs.size != sum(x.size for x in jax.tree.leaves(policy.params)):
-        raise UserError("the policy has weights of layers that are unknown here; give --to stablehlo")
+        raise UserError("the policy has layers without an exporter; give --to stablehlo")
     return graph
 
 

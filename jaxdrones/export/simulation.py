@@ -75,7 +75,7 @@ class Simulation:
 
 @checked
 def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of drones")] = 1) -> Simulation:
-    """Simulation of the nominal vehicle of an environment, flown to a target, to stay, by a policy or by controllers.
+    """Simulation of the nominal vehicle of an environment, which a policy or controllers fly to a target.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
     external force (N, world). The drones fly without influence on each other, each at its own goal.
@@ -106,7 +106,7 @@ def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of
 
 
 def page(policy: Policy, env: Env, title: str, drones: int = 1) -> Page:
-    """Page in which anyone can push drones that a policy flies; arguments and errors as for `simulation`."""
+    """Page with an interactive simulation of drones under a policy; arguments and errors as for `simulation`."""
     made = simulation(policy, env, drones)
     one = jax.tree.map(lambda x: x[0], env.params)
     params = jax.tree.map(np.asarray, jax.device_get(repeat(one, drones)))

@@ -57,7 +57,7 @@ class Description:
 
 
 def block_comment(lines: list[str]) -> str:
-    """Lines as a comment of C and JavaScript, which nothing in them can end or upset."""
+    """Lines as a comment of C and JavaScript, with all special character sequences broken up."""
     for text, harmless in (("*/", "* /"), ("/*", "/ *"), ("??", "? ?"), ("\\", "/")):
         lines = [line.replace(text, harmless) for line in lines]
     return "\n".join(["/*", *(f" * {line}".rstrip() for line in lines), " */"])

@@ -46,9 +46,9 @@ def critic_observation(
 ) -> Obs:
     """Observations of the critic, normalized.
 
-    The hidden state (*batch, n, ...) is that after the observations (*batch, n, d), or a dictionary with images; a
-    privileged observation replaces their vector. The actions (*batch, n, a) of all drones are those of a centralized
-    critic, see `centralized_input`.
+    The hidden state (*batch, n, ...) is that after the observations, (*batch, n, d) or a dictionary with images. A
+    privileged observation replaces the vector of the observations. The actions (*batch, n, a) of all drones are inputs
+    of a centralized critic, see `centralized_input`.
     """
     vector = state_vector(obs) if privileged is None else privileged.obs
     x = policy.obs_stats.normalize(vector)

@@ -56,8 +56,8 @@ class GradientConfig(Config):
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
     outlier_gradient: PositiveOrInfinite = _UNLIMITED
-    """Largest gradient of a world at a control step over the median of all worlds; longer ones are scaled down. A few
-    chaotic worlds then cannot drown the others."""
+    """Largest gradient of a world at a control step, relative to the median of all worlds. Longer ones are scaled down,
+    so that a few chaotic worlds do not dominate."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Switch = True

@@ -76,7 +76,7 @@ class OwnNetwork:
         return id(self.module)
 
     def init(self, key: jax.Array, example: Obs) -> Any:
-        """Initial parameters; the key is for a linen module alone."""
+        """Initial parameters; only a linen module uses the key."""
         if isinstance(self.module, nn.Module):
             state = (self.module.initial_hidden_state(),) if self.recurrent else ()
             return self.module.init(key, *state, example)
@@ -213,9 +213,9 @@ class Policy(PyTreeNode):
     def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "*batch a"]:
         """Actions of a sequence of normalized observations (t, *batch, n, d), or of a dictionary of them.
 
-        The hidden state (*batch, n, ...) is that before the first observation; `starts` (t, *batch) tell whether an
-        episode starts with an observation, and are `None` without a hidden state. Without both and `per_agent` the
-        leading axes are any.
+        The hidden state (*batch, n, ...) is that before the first observation; `starts` (t, *batch), whether an episode
+        starts with an observation, is `None` without a hidden state. Without both, and without `per_agent`, any leading
+        axes are possible.
         """
         return jnp.tanh(apply(self.network, self.params, obs, self.per_agent, hidden_state, starts)[1])
 

@@ -47,7 +47,7 @@ def check_config(config: Any, kind: type) -> None:
     if isinstance(config, dict):
         raise UserError(f"config is a dictionary; give jaxdrones.learning.{learner}.Config(**config)")
     given = f"{_learner(type(config))}.Config" if dataclasses.is_dataclass(config) else short_repr(config)
-    raise UserError(f"config is {given}; {learner} learns with jaxdrones.learning.{learner}.Config(...)")
+    raise UserError(f"config is {given}; give jaxdrones.learning.{learner}.Config(...)")
 
 
 def _learner(kind: type) -> str:

@@ -38,7 +38,7 @@ def single(step: Callable) -> SingleStep:
 
 def command_unit(params: Params) -> Float[Array, ""]:
     """Unit of commands and rotor speeds here: the hover speed, RPM."""
-    check_shape("params.mass", params.mass, (), "optimal control is about one drone; use jax.vmap for a team")
+    check_shape("params.mass", params.mass, (), "optimal control is for one drone; use jax.vmap for a team")
     if is_concrete(params.gravity) and not np.asarray(params.gravity) > 0:
         raise UserError(
             f"params.gravity is {short_repr(params.gravity)}; optimal control scales commands by the hover speed, "

@@ -60,7 +60,7 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`.
 
-    There is no plan, and so no status: those of a state that is not finite are not finite.
+    There is no plan and no status: the rotor speeds for a state that is not finite are not finite.
     """
     check_plan(settings.horizon, setpoints, settings.step, dt)
     target = reference(params, setpoints, state.aux, dt)

@@ -60,7 +60,7 @@ class Mpc:
         Raises:
             ValueError: a model of a team, or an unknown solver.
         """
-        check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
+        check_shape("model.params.mass", model.params.mass, (), "Mpc controls one drone; make one for each")
         self.model, self.horizon, self._dt = model, horizon, dt
         self.seconds = float("nan")
         """Duration of the last call of the solver, s."""
@@ -145,8 +145,8 @@ class Mpc:
     ) -> np.ndarray:
         """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
 
-        The setpoints are those at this and the next H control steps, arrays (H + 1, ...). `params` are the values of
-        the model's symbolic constants, by default those of the model. Without a new plan, `hold` repeats the last safe
+        The setpoints are those at the current and the next H control steps, arrays (H + 1, ...). `params` are the values
+        of the model's symbolic constants, by default those of the model. Without a new plan, `hold` repeats the last safe
         command, initially that of hover, and `raise` raises. See `status` and `message`.
 
         Raises:

@@ -104,9 +104,9 @@ def hover(params: Params, state: State) -> State:
 def posed(
     settings: Any, params: Params, memory: Any, state: State, setpoints: Setpoint, dt: float, on_failure: str
 ) -> tuple[Bool[Array, ""], State, Reference]:
-    """Problem of a planner of this call: its validity, the state and the reference.
+    """Problem of a call of a planner: its validity, the state and the reference.
 
-    An invalid problem is that of hover at the origin, to keep NaN out of plans and gradients.
+    An invalid problem is replaced by hover at the origin, to keep NaN out of plans and gradients.
 
     Raises:
         ValueError: a wrong time between calls, number of setpoints, or `on_failure` for these arguments.
@@ -131,6 +131,6 @@ def check_plan(
     check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
     if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves((setpoints, given)))):
         raise UserError(
-            "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
+            "on_failure is 'raise' inside jax.jit or jax.vmap, where errors cannot depend on values; leave it out, and "
             "check the status of the memory"
         )

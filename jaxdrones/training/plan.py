@@ -14,9 +14,9 @@ from jaxdrones.training import distributed
 EVALUATIONS = 10
 """Number of evaluations of a training."""
 STOPPING_EVALUATIONS = 30
-"""Number of evaluations of a training with a success rate to stop at."""
+"""Number of evaluations of a training with `stop_at`."""
 IN_A_ROW = 3
-"""Number of consecutive evaluations with this rate to stop at."""
+"""Number of consecutive evaluations at `stop_at` that end a training."""
 _EVALUATION_SHARE = 0.25  # largest fraction of a time budget for evaluations, except for the first and the last two
 
 SELECTION_STREAM, REPORT_STREAM = 2**31, 2**31 + 1

@@ -51,7 +51,7 @@ class Trainer:
         self.compile_seconds = time.perf_counter() - start
 
     def compile(self) -> None:
-        """Compile the programs, the updates beside the others: `start(key)`, `evaluate(policy, key)` and `advance`."""
+        """Compile the programs `start(key)`, `evaluate(policy, key)` and `advance`, the last one concurrently."""
         start = time.perf_counter()
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         init = compilation.jit(self._init, self.practice_env, in_shardings=same, out_shardings=state)
@@ -86,7 +86,7 @@ class Trainer:
 
 
 def _devices(config: Any) -> list[jax.Device]:
-    """All devices of all hosts; of the cores of a single CPU, as many as share worlds and minibatches equally."""
+    """All devices of all hosts; on a single CPU, as many cores as can share worlds and minibatches equally."""
     devices = jax.devices()
     if devices[0].platform != "cpu" or jax.process_count() > 1:
         return devices

@@ -152,7 +152,7 @@ def test_tianshous_worlds_fly_as_gymnasiums_and_stand_still_where_not_stepped():
     from jaxdrones.adapters.tianshou import VectorEnv
 
     envs, alone = VectorEnv("hover", 3, duration=0.05), gymnasium.make(HOVER, duration=0.05)
-    with pytest.raises(ValueError, match="before all were"):
+    with pytest.raises(ValueError, match="before the first reset of all"):
         envs.reset([1])
     start, _ = envs.reset(seed=[3, 4, 5])
     again, _ = envs.reset(seed=3)

@@ -170,7 +170,7 @@ def test_what_cannot_be_exported_is_said(env, tmp_path):
     with pytest.raises(ValueError, match=r"the policy is <function .*; give one of jaxdrones.learning"):
         save(lambda obs: obs[:, :4], env, "c", tmp_path)
     params = policy.params["params"] | {"Gate_0": {"kernel": jnp.ones((2, 2))}}
-    with pytest.raises(ValueError, match="weights of layers that are unknown here; give --to stablehlo"):
+    with pytest.raises(ValueError, match="has layers without an exporter; give --to stablehlo"):
         save(policy.replace(params={"params": params}), env, "c", tmp_path)
     with pytest.raises(ValueError, match="unknown target 'rust'"):
         save(policy, env, "rust", tmp_path)

@@ -28,7 +28,7 @@ _ROWS = ("t", *STATE, *OPTIONAL)  # growing arrays of a log
 class Live(contextlib.AbstractContextManager["Live"]):
     """Context with a server that shows flights live to any number of viewers.
 
-    It is reachable only from this machine, by the secret in `url`. A viewer that connects late can see the whole flight.
+    It is reachable only from this machine, by the secret in `url`. A late viewer can see the whole flight.
 
     Args:
         port: port of the server; 0 for a free one.

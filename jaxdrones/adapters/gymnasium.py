@@ -229,7 +229,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 f"reset_mask has shape {mask.shape} and dtype {mask.dtype}; give ({self.num_envs},) of True and False"
             )
         if not self._worlds.started:
-            raise gymnasium.error.ResetNeeded("worlds are reset by a mask before the first reset of all; call reset first")
+            raise gymnasium.error.ResetNeeded("a mask is given before the first reset of all worlds; call reset first")
         return mask
 
     def _out(self, tree: Any) -> Any:

@@ -145,9 +145,9 @@ class Mpc:
     ) -> np.ndarray:
         """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
 
-        The setpoints are those at the current and the next H control steps, arrays (H + 1, ...). `params` are the values
-        of the model's symbolic constants, by default those of the model. Without a new plan, `hold` repeats the last safe
-        command, initially that of hover, and `raise` raises. See `status` and `message`.
+        The setpoints are those at the current and the next H control steps, arrays (H + 1, ...). `params` are the
+        values of the model's symbolic constants, by default those of the model. Without a new plan, `hold` repeats
+        the last safe command, initially that of hover, and `raise` raises. See `status` and `message`.
 
         Raises:
             ValueError: arrays of a team, or a wrong number of setpoints.

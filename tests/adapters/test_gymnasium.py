@@ -217,7 +217,7 @@ def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of
     envs = vector_of(AutoresetMode.DISABLED)
     start, _ = envs.reset(seed=[5, None, 1])
     np.testing.assert_array_equal(start[0], vector_of().reset(seed=5)[0][0])
-    with pytest.raises(gymnasium.error.ResetNeeded, match="before the first reset of all"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match="before the first reset of all worlds"):
         VectorEnv(short(env_of), 3).reset(options={"reset_mask": np.ones(3, bool)})
     for _ in range(5):
         last, *_, truncated, _ = envs.step(np.zeros((3, 4)))

@@ -1,8 +1,7 @@
 """Run a benchmark: `python -m benchmarks NAME [--quick] [--json]`; `NAME --help` lists its options.
 
 A benchmark is a module with a docstring that asks its question, `main(options) -> (result, lines)`, and
-`add_arguments(parser)` where it has options of its own. Versions, machine and commit, and the
-printed lines, are added to every result.
+`add_arguments(parser)` if it has options. Versions, machine, commit and the printed lines are added to every result.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""What is right and what is fast on an accelerator, in one command of at most ten minutes?
+"""Are the results on an accelerator correct, and how fast is it, in one command of at most ten minutes?
 
-Some tests, the plant, cameras, environments, teams of eight drones and learners, each in a process of its own that has
-a share of the time; what it measured until then counts. The ratios are to figures that others publish (published.py),
-on the hardware that they name: they say how far apart the figures are, not how much of it is due to the code.
+Tests, the plant, cameras, environments, teams of eight drones and learners, each in a separate process with a share of
+the time; results that were measured until its end count. The ratios are relative to published figures (published.py) on
+the hardware named there. They do not show how much of a difference is due to the code.
 """
 
 import argparse

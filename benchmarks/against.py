@@ -1,8 +1,8 @@
 """Compare the speed of the working tree with that of another commit; what `track --against` prints.
 
-The commit is checked out into a temporary worktree. Each side is a process with its own package and its own programs
-(server.py); they take turns. A row is measured in three rounds, and once more in fresh processes if it lost in all of
-them. It fails if it lost all rounds, both times: a busy machine loses some of them, never all.
+The commit is checked out into a temporary worktree. Each side is a process with its own package and programs
+(server.py); they are measured alternately, in three rounds, and again in new processes if a program was slower in all
+of them. It fails if it was slower in all rounds both times, which other programs on the machine do not cause.
 """
 
 import contextlib

@@ -1,13 +1,13 @@
-"""Do simulators agree on the same flight, and where they do not, why?
+"""Do simulators agree on the same flight, and what causes the differences?
 
-A tape of rotor speeds, a start that turns and moves, one second, float64 (l2f: float32). Everybody flies it: ours as it
-comes; gym-pybullet-drones (2021) and (2.x), both of its models, from recorded data (tests/golden); and, in an
-environment of their own (venv.py), crazyflow 0.4.0, rotorpy 3.0.0 and, where it can be installed, l2f 2.0.18,
-with their own default integrators. Tapes of other vehicles have the same shares of hover speed.
+All simulators start from the same tilted state in motion and receive the same rotor speeds for one second, in float64
+(l2f: float32): jaxdrones with its defaults; gym-pybullet-drones (2021) and (2.x), both physics models of each, from
+recorded data (tests/golden); and, in a separate environment (rivals/environment.py), crazyflow 0.4.0, rotorpy 3.0.0
+and, if it can be installed, l2f 2.0.18, with their default integrators. Rotor speeds are fractions of hover speed.
 
-A difference is the largest in that second. Each has its causes, which agreement_switches.py switches in ours, so that
-ours does what the other does. `all switched` is what is left, which should be rounding; the row of a cause is what is
-left when all others are switched and this one is not.
+The result is the largest difference during the second. rivals/switches.py switches each cause of a difference to the
+behavior of the other simulator. `all switched` is the remaining difference, which should be rounding errors; the row of
+a cause is the difference with all causes switched except this one.
 """
 
 import argparse

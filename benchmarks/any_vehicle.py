@@ -1,16 +1,16 @@
-"""Does one policy hover every quadrotor, and for how long a delay and how strong a wind?
+"""Can one policy hover every quadrotor, with which delays and wind speeds?
 
-Policies for all vehicles: `any-vehicle`, trained here by `jaxdrones train hover --realistic any`, and RAPTOR as
-published. Neither is told a parameter of the vehicle. Both fly the default starts of `hover` (up to 1 m, 1 m/s, 1 rad/s
-and 90 degrees away, scaled by the vehicle where it is drawn) in the same episodes:
+Policies for all vehicles: `any-vehicle`, trained by `jaxdrones train hover --realistic any`, and RAPTOR as published.
+Neither receives parameters of the vehicle. Both fly the default starts of `hover` (up to 1 m, 1 m/s, 1 rad/s and 90
+degrees away, scaled by a random vehicle) in the same episodes:
   NAME        a bundled vehicle, lagging rotors, without delay and noise;
-  drawn       vehicles of 20 g to 3 kg, drag, sensor noise, a delay of 0 to 40 ms, another one in every episode;
-  A to B kg   the same, vehicles of a class of masses;
-  A to B kg, T s  the same in T seconds: the time to settle grows as the root of the arm (Froude scaling), from 3 s
-              for a Crazyflie to that of the lightest vehicle of the class;
-  delay       drawn vehicles with a delay in all episodes;
-  wind        drawn vehicles with a delay of 0 to 40 ms in Dryden gusts of 7.7 m/s at 20 ft.
-Success is within 5 cm and 0.1 m/s of the goal for the last two of five (or T) seconds, in wind within 25 cm.
+  drawn       a random vehicle of 20 g to 3 kg in every episode, drag, sensor noise, a delay of 0 to 40 ms;
+  A to B kg   the same for a range of masses;
+  A to B kg, T s  the same in T seconds: the time to settle grows with the square root of the arm (Froude scaling), from
+              3 s for a Crazyflie to that of the lightest vehicle of the range;
+  delay       random vehicles with the same delay in all episodes;
+  wind        random vehicles with a delay of 0 to 40 ms in Dryden gusts of 7.7 m/s at 20 ft.
+Success: within 5 cm and 0.1 m/s of the goal for the last two of five (or T) seconds; in wind within 25 cm.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""How well does the battery model repeat the voltage of recorded flights?
+"""How well does the battery model reproduce the voltage of recorded flights?
 
-For every flight (an npz of NanoBench with `t`, `pwm` and `vbat`) the charge follows from the voltage at rest before it,
-and the resistance from the first seconds with the motors on. Then the model flies the recorded PWM alone, to the end.
+For every flight (an npz of NanoBench with `t`, `pwm` and `vbat`) the charge is estimated from the voltage at rest
+before it, and the resistance from the first seconds with the motors on. After that, the recorded PWM is the only input.
 """
 
 import argparse

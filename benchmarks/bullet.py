@@ -1,7 +1,7 @@
-"""How many steps and frames per second does the Bullet backend make?
+"""How many steps and frames per second does the Bullet backend compute?
 
-Per second of processor time of one process, so that other processes matter less. A physics step is 1/240 s. Medians of
-repeats, all in one run.
+Rates are per second of CPU time of one process, which depends less on other processes. A physics step is 1/240 s.
+Medians of repeats, all in one run.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""How many images per second do the cameras make, and what limits it?
+"""How many images per second do the cameras render, and what limits them?
 
-Scene A: 10 boxes and 10 spheres within 6 m, the same in every world, no ground, 12 m range, 80 degrees, cameras turned
-at random. Scene B: a forest of 103 solids (ground, 40 boxes, 30 spheres, 32 cylinders), another one in every world. For
-both: depth alone, depth with segmentation, with one step of physics before each image, and with the gradient of the
-depth with respect to the pose (forward and backward). Beside them Bullet's TinyRenderer, which makes depth,
-segmentation and color at once, and crazyflow 0.4.0, whose depth is a ray by MJX for every pixel, on scene A, in the
-rivals' environment. Float32; medians of repeats, all in one run; compile times apart, with an empty cache.
+Scene A: 10 boxes and 10 spheres within 6 m, the same in every world, no ground, a range of 12 m, 80 degrees, random
+camera attitudes. Scene B: a forest of 103 solids (ground, 40 boxes, 30 spheres, 32 cylinders), different in every
+world. For both: depth; depth and segmentation; one physics step before each image; and the gradient of the depth with
+respect to the pose (forward and backward). For comparison, on scene A: Bullet's TinyRenderer, which renders depth,
+segmentation and color together, and crazyflow 0.4.0, which computes the depth of each pixel with an MJX ray, in a
+separate environment. Float32; medians of repeats in one run; compile times are separate, with an empty cache.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The scenes of the benchmark of cameras, as numbers that any renderer can read."""
+"""Scenes of the camera benchmark, as numbers for any renderer."""
 
 import jax
 import jax.numpy as jnp

@@ -1,12 +1,12 @@
-"""How many drones of a crowd reach their goals without touching, with a policy that was trained with eight?
+"""What fraction of a crowd of drones reach their goals without contact, by learned policies and by baselines?
 
-One drone per cubic meter; starts and goals are random. `safe`: the drone never came closer to another one than two
-collision radii, also between control steps; `reached`: it was within 10 cm of its goal in the end; `success`: both,
-with a 95 % interval that counts the drones of a world as far as they are independent.
+One drone per cubic meter, random starts and goals. `safe`: the drone never came closer to another one than two
+collision radii, including between control steps; `reached`: it is within 10 cm of its goal at the end; `success`: both,
+with a 95 % interval that accounts for the correlation between drones of a world.
 
-Policies: `bptt`, the preset; `stopped`, the same with the other drones constant in the derivative of observation and
-reward; `blind`, the same without a view of the others; `ppo`, the same network by PPO in the time that `bptt` took; and
-`cbf` and `velocity-obstacles`, which do not learn (crowd_baselines.py).
+Policies, trained with eight drones: `bptt`, the preset; `stopped`, the same with the other drones constant in the
+derivatives of observation and reward; `blind`, the same without observing the others; `ppo`, the same network by PPO in
+`--seconds`; and, without learning, `cbf` and `velocity-obstacles` (crowd_baselines.py).
 """
 
 import argparse

@@ -1,7 +1,8 @@
 """Collision avoidance without learning, as policies of `crowd`: control barrier functions and velocity obstacles.
 
-Both fly straight to the goal like the reward of the task asks, and change that as little as their constraints permit:
-a quadratic program in three variables for every drone, solved by qpax. They see what the learned policies see.
+Both fly straight to the goal, as the reward of the task requires, with the smallest change that satisfies their
+constraints: a quadratic program in three variables for every drone, solved by qpax. Their observations are those of the
+learned policies.
 """
 
 from __future__ import annotations

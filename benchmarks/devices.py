@@ -1,7 +1,7 @@
-"""How much faster is a learner's update on several devices than on one?
+"""How much faster is training with a second device?
 
-Both programs run in one process, in alternation; the times are medians. A CPU is divided into devices
-(`--cpu-devices`); since XLA uses all cores for one device too, the result on a CPU shows the cost of sharing.
+Both programs run alternately in one process; the times are medians. A CPU is divided into devices (`--cpu-devices`);
+since XLA uses all cores for one device too, the result on a CPU shows the cost of sharding.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""How many environment steps per second, with observation, reward and a fresh reset of every episode that ends?
+"""How many environment steps per second, with observation, reward and autoreset?
 
-Inside one compiled program, on one or more devices; through gymnasium's `make_vec` with NumPy in and out; and one
-gymnasium environment.
+In one compiled program, on one or more devices; through gymnasium's `make_vec` with NumPy inputs and outputs; and in
+one gymnasium environment.
 """
 
 import argparse

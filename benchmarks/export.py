@@ -1,10 +1,9 @@
-"""How far is an exported policy from the policy, what does a call cost, and does it fly as well?
+"""How much does an exported policy differ from the original, how long does a call take, and does it fly as well?
 
-Policies of bptt are compared on what they observe in 16 of their flights, untrained ones on random
-observations; the hidden state of a recurrent policy is kept for the whole flight. The difference is the largest of any
-action, whose range is -1 to 1; that of float64 is the rounding of the policy itself. The code is what `cc -Os` makes of
-the functions without the weights, and a call in C is timed on this machine. Whole evaluations are flown by the policy
-and by its C.
+Policies of bptt are compared on the observations of 16 flights, untrained ones on random observations; a recurrent
+policy keeps its hidden state for a whole flight. The result is the largest difference of any action, with a range of -1
+to 1; `float64` is the difference of the policy from itself in float64. The code size is that of `cc -Os` without the
+weights, and the time is that of a call in C. Whole evaluations are flown with the policy and with its C function.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Policies with random weights, and programs that run what is exported of them."""
+"""Policies with random weights, and programs that run their exported files."""
 
 import ctypes
 import json

@@ -1,13 +1,13 @@
-"""Does `control.firmware_pid` command what the firmware commanded, and what does it cost?
+"""Does `firmware_pid` compute the same commands as the firmware, and how long does a call take?
 
-Logs of NanoBench are files with est_pos, est_vel, est_quat, gyro, ref_pos, ref_yaw, vbat, pwm and cmd at 100 Hz. From
-the first row with thrust on, with empty integrators and five calls at 500 Hz for each row, the controller is given the
-logged estimate and set-points; nothing it commands is flown. Its desired roll and pitch (degrees) and its thrust (16
-bit) are compared with the logged ones. Integrators of height drift with the gaps of a log, so that of the thrust there
-is also what is left after a parabola in time.
+Logs of NanoBench have est_pos, est_vel, est_quat, gyro, ref_pos, ref_yaw, vbat, pwm and cmd at 100 Hz. From the first
+row with thrust, with integrators at zero and five calls at 500 Hz per row, the controller receives the logged estimates
+and set-points; its commands are not simulated. Its desired roll and pitch (degrees) and its thrust (16 bit) are
+compared with the logged ones. The height integrator drifts because of gaps in the log, so the difference in thrust is
+also reported without a parabola in time.
 
-The cost is that of a step of one Crazyflie in each of many worlds by `over_worlds`, at 500 Hz with a new set-point at
-every step, over that of the attitude loop and mixer of `pid` in the same run.
+The cost is the time of a step of one Crazyflie in each of many worlds by `over_worlds`, at 500 Hz with a new set-point
+in every step, relative to the attitude loop and mixer of `pid` in the same run.
 """
 
 import argparse

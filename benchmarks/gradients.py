@@ -1,8 +1,8 @@
-"""How large and how noisy is the gradient of a flight, as a function of its length and of how it is differentiated?
+"""How do norm and noise of the policy's gradient grow with the horizon?
 
-This is the gradient of the mean reward of the first h control steps with respect to the policy's parameters, for each
-world: the norm of its mean over worlds, and the root mean square distance from that mean (the noise of a single world),
-for a policy at the start of a training and for one that BPTT has trained.
+The gradient is that of the mean reward of the first h control steps with respect to the policy's parameters, in each
+world. The results are the norm of its mean over the worlds and the root mean square distance from this mean (the noise
+of a single world), for an untrained policy and for one trained by BPTT.
 """
 
 import argparse

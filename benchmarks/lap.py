@@ -1,9 +1,9 @@
 """How close to the time-optimal lap of a point mass does a policy fly?
 
 Level 0 of the task `race`, one drone from rest on the ground to the last gate. The bound is the fastest flight of a
-point mass whose thrust has the vehicle's limit and any direction at once, without drag: constant accelerations in
-`--nodes` intervals per gate, solved by IPOPT (CasADi). `openings`: it may pass anywhere in the openings, a bound for
-every flight; `drone`: with the drone's radius between its center and the frame; `centers`: through the centers.
+point mass with the maximum thrust of the vehicle in any direction without delay, without drag: constant accelerations
+in `--nodes` intervals per gate, solved by IPOPT (CasADi). `openings`: it may pass anywhere in the openings, a bound for
+every flight; `drone`: with a drone's radius between its center and the frame; `centers`: through the centers.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""Who flies what, how well, at which cost: controllers, planners and learned policies in the same scenarios?
+"""How do controllers, planners and learned policies compare in the same scenarios, in success and computing time?
 
-`python -m benchmarks leaderboard --pilot geometric --scenario hover` makes one row: it tunes or trains the pilot in the
-undisturbed scenario, on starts of its own, and then flies the scored starts, which are the same for all pilots. Without
-options it makes the whole table. `success` with its 95 % interval (Wilson) is over the distinct flights; `error` is the
-distance from the target in the end, median and 99th percentile; `effort` is the root mean square of the rotor speeds'
-difference from hover; `us` is the processor time of a command for one drone in a compiled loop without physics (of
-`mpc` the median of its calls), `obtain` that of tuning or training with compilation, and `flown` the simulated flight
-in it.
+`python -m benchmarks leaderboard --pilot geometric --scenario hover` computes one row: it tunes or trains the pilot in
+the undisturbed scenario, on separate starts, and then flies the scored starts, which are the same for all pilots.
+Without options it computes the whole table. `success` has a 95 % interval (Wilson) over the distinct flights; `error`
+is the distance from the target at the end, median and 99th percentile; `effort` is the root mean square deviation of
+the rotor speeds from hover; `us` is the CPU time of a command for one drone in a compiled loop without physics (for
+`mpc` the median of its calls), `obtain` that of tuning or training including compilation, and `flown` the simulated
+time of flight in it.
 """
 
 import argparse

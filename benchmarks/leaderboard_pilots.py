@@ -1,8 +1,8 @@
-"""Pilots of the leaderboard: how each is obtained, on the nominal scenario alone.
+"""Pilots of the leaderboard, and their tuning or training in the nominal scenario.
 
-All are policies with the action `rpm`. A controller is tuned by a random search: the factors of its gains that succeed
-most often in flights from the starts of tuning, and of equals those with the smallest error. iLQR and MPPI fly with the
-package's weights or those tuned for LQR, MPC with those of the package.
+All are policies with the action type `rpm`. A controller is tuned by random search for the factors of its gains with
+the highest success rate, and among equal ones the smallest error, from the starts for tuning. iLQR and MPPI have the
+default weights or those tuned for LQR, MPC the default weights.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Scenarios of the leaderboard: what is flown, when it is a success, and what a pilot observes.
+"""Scenarios of the leaderboard: flights, criteria of success, and observations of a pilot.
 
-A Crazyflie (`cf2x`) with drag and rotors that lag by 55 ms; the published 249 ms for slowing down are left out, because
-identifications of the vehicle differ by a factor of five in it.
+The vehicle is a Crazyflie (`cf2x`) with drag and a rotor lag of 55 ms; the published 249 ms for slowing down are not
+used, because identifications of this value differ by a factor of five.
 """
 
 from __future__ import annotations

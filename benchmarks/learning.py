@@ -1,7 +1,7 @@
-"""How long does a learner train, and how well does its policy fly? Times, success and error of each seed.
+"""How well does a trained policy fly, and how long does training take, seed by seed?
 
-Compilation is timed for a cold start (compilation cache off) unless --cache is given, and includes tracing; all seeds
-share one program. The time of evaluations is not counted.
+Compilation is timed with an empty compilation cache unless --cache is given, and includes tracing; all seeds share one
+program. The time of evaluations is not included.
 """
 
 import argparse

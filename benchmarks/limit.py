@@ -1,12 +1,12 @@
-"""What share of the speed of hand-written C does our plant reach on this CPU?
+"""What fraction of the speed of hand-written C does jaxdrones reach on this CPU?
 
-Both fly one Crazyflie per world: lagging rotors, drag, semi-implicit Euler at 240 Hz, float32, rotor speeds held. The C
-(`plant.c`, structure of arrays, all cores) is compiled here, counts only after it has flown our trajectory, and is
-measured in turn with ours. Ours flies by `jax.vmap`, by `over_worlds`, and by that on one device for each core.
+Both simulate one Crazyflie per world: lagging rotors, drag, semi-implicit Euler at 240 Hz, float32, constant commands.
+The C program (`plant.c`, structure of arrays, all cores) is compiled here; it counts only if its trajectory agrees, and
+is measured alternately with jaxdrones, by `jax.vmap`, `over_worlds`, and `over_worlds` with one device for each core.
 
-For accelerators: a step reads and writes 17 numbers and reads a command of 4, 152 bytes in float32, and makes about 290
-additions and multiplications, 15 divisions and a root, 2 operations a byte. An H100 (3.35 TB/s, 67 T operations/s) is
-so bound to 22 G drone-steps/s with a kernel per step, and to some 200 G with many steps in one kernel.
+For accelerators: a step reads and writes 17 numbers and reads a command of 4, 152 bytes in float32, and takes about 290
+additions and multiplications, 15 divisions and a square root, 2 operations per byte. The limit of an H100 (3.35 TB/s,
+67 T operations/s) is 22 G drone-steps/s with one kernel per step, and about 200 G with many steps in one kernel.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""What do solid obstacles cost the plant, near and far?
+"""How much do solid obstacles, near and far, slow down a step?
 
-One drone a world, drag, semi-implicit Euler at 240 Hz, in a compiled loop of one second, and the gradient of the
-final position with respect to its commands; nanoseconds a step. The drones start anywhere between 20 solids at up to
-2 m/s; `far` are the same solids out of reach. `over` is the time over that of the plant without obstacles.
+One drone per world, drag, semi-implicit Euler at 240 Hz, in a compiled loop of one second; and the gradient of the
+final position with respect to the commands. Times are nanoseconds per step. The drones start among 20 solids at up to
+2 m/s; with `far` the same solids are out of reach. `over` is the time relative to the plant without obstacles.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""How closely do optimal controllers track, how long does a command take, and what does the symbolic twin cost?
+"""How accurately do optimal controllers track, and how long does a command take?
 
-A Crazyflie with drag tracks curves about (0, 0, 2) m from the motion of their start, at 100 control steps per second
-(MPC by CasADi: 40), with the setpoints' velocity and acceleration given to all controllers alike. The error is the root
-mean square of the distance to the curve after the first second. The time is that of one command for one drone; of MPC
-it is the solver's alone.
+A Crazyflie with drag tracks curves about (0, 0, 2) m, starting with the motion of the curve, at 100 control steps per
+second (MPC: 40). All controllers receive velocity and acceleration of the set-points. The error is the root mean square
+distance from the curve after the first second. The time is that of a command for one drone; for MPC that of the solver.
+The cost of the symbolic twin is also measured.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""What does each option of XLA's CPU compiler cost or gain, program by program?
+"""How does each option of XLA's CPU compiler affect compile time and speed, program by program?
 
-Seconds to compile, without tracing, and the time of a call, for programs of benchmarks/programs.py: with the defaults
-of XLA, with each of its code generators for elementwise code (`xla_cpu_use_fusion_emitters`, off is the older one) at
-each level of LLVM's optimization, and with the options of `over_worlds`. All options of a program take turns, and the
-numbers are medians. The options that the package chooses are in jaxdrones/accelerate/compiler.py.
+Compile time without tracing, and time of a call, of the programs in benchmarks/programs.py: with XLA's defaults, with
+each of its code generators for elementwise code (`xla_cpu_use_fusion_emitters`; off is the older one) at each
+optimization level of LLVM, and with the options of `over_worlds`. All options of a program are measured alternately;
+results are medians. jaxdrones/accelerate/compiler.py has the options that the package uses.
 """
 
 import argparse

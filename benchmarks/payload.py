@@ -1,11 +1,11 @@
-"""How close to its curve, and with how much swing, does a policy of bptt fly a load on cables?
+"""How accurately, and with how much swing, does a policy fly a load on cables along a curve?
 
-Flights of 10 s from random starts; error and swing count from the first second on, as in the task's criterion of
-success. `error`: root mean square distance of the load from its target in a flight; `swing`: largest angle in a flight
-between the vertical and the line from the load to its drone, or to the middle of the team.
+Flights of 10 s from random starts; error and swing count after the first second, as in the task's criterion of success.
+`error`: root mean square distance of the load from its target; `swing`: largest angle between the vertical and the line
+from the load to its drone, or to the middle of the team.
 
-`--learner geometric` flies the task `sling` with the geometric controller in place of a policy: it knows the mass of
-the load, and holds the place above the target, as if the cable were a rod that does not swing.
+`--learner geometric` flies the task `sling` with the geometric controller instead of a policy. It knows the mass of the
+load, and holds the drone above the target of the load at the length of the cable.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""What do a battery, PWM motors, rotor inertia and moving air cost a step?
+"""How much do a battery, PWM motors, rotor inertia and aerodynamics slow down a step?
 
-A world is one Crazyflie with drag and lagging rotors; commands change at every step. All cases take turns in one run.
+A world is one Crazyflie with drag and lagging rotors; commands change in every step. All cases are run alternately.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The fixed programs of track.py and options.py: what each does, and how the package compiles it."""
+"""Fixed programs of track.py and options.py, with their definitions and compiler options."""
 
 import dataclasses
 import functools

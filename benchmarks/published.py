@@ -1,4 +1,4 @@
-"""Figures that others publish, each with its hardware and source; what accelerator.py compares with."""
+"""Published figures with hardware and source, for the comparison in accelerator.py."""
 
 import dataclasses
 

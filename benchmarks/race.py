@@ -1,24 +1,24 @@
-"""How many times as fast as other simulators are we, on the same work in the same run?
+"""How many times faster than crazyflow and rotorpy is jaxdrones, for the same flight in the same run?
 
-crazyflow 0.4.0 and rotorpy 3.0.0 live with this library in an environment of their own, made at the first call
-(venv.py); one process there races all of them, A B A B, medians of repeats (rivals_races.py). The races:
+crazyflow 0.4.0 and rotorpy 3.0.0 are installed with jaxdrones in a separate environment at the first call
+(rivals/environment.py); one process measures all of them alternately, medians of repeats (rivals/races.py). Races:
 
   plant-symplectic_euler, plant-euler, plant-rk4
-      rotor speeds held, lagging rotors, constant drag, our Crazyflie told to crazyflow, 500 Hz, float32. `euler` is
-      crazyflow's default; it turns by the exponential map where ours adds and normalises.
+      constant commands, lagging rotors, drag independent of rotor speeds, our Crazyflie in both, 500 Hz, float32.
+      `euler` is crazyflow's default, which updates the attitude by the exponential map; ours adds and normalizes.
   attitude
-      each simulator's own Crazyflie under its own cascade at 500 Hz, a new attitude and thrust at every step: here the
+      each simulator's own Crazyflie and cascade at 500 Hz, with a new attitude and thrust in every step: here the
       attitude loop and mixer of `pid`, there the Mellinger controller.
   rotorpy
-      the plant without drag, by rk4, float64: rotorpy has no other numbers, no Euler, and drag at each rotor.
+      the plant without drag, rk4, float64, because rotorpy has only float64, no Euler, and drag at each rotor.
 
-Everybody flies many steps in one compiled program if it can (rotorpy cannot) and returns the whole final state; starts,
-commands and vehicle are known at run time only. crazyflow flies on one device and shared by its own sharding, compiled
-by default and with our options; we do by `jax.vmap`, by `over_worlds`, and by that on all devices. A ratio is of the
-best of each, and printed only if all end a flight of 64 worlds and two seconds (rotorpy 0.2 s) in the same state
-(`AGREED`), or `attitude` in the attitude asked for.
+Each simulator runs many steps in one compiled program if it can (rotorpy cannot) and returns the whole final state;
+starts, commands and vehicle are known only at run time. crazyflow runs on one device and with its own sharding, with
+default compiler options and with ours; jaxdrones runs by `jax.vmap`, `over_worlds`, and `over_worlds` on all devices. A
+ratio compares the best of each, and is reported only if all flights of 64 worlds and two seconds (rotorpy 0.2 s) end in
+the same state (`AGREED`), or for `attitude` in the commanded attitude.
 
-PyFlyt 0.29.0 is not raced: it needs numpy below 2, this library 2 or later, so they cannot share a process.
+PyFlyt 0.29.0 is not compared: it needs numpy below 2 and jaxdrones numpy 2, so they cannot share a process.
 """
 
 import argparse

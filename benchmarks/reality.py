@@ -1,25 +1,25 @@
-"""Which simulator repeats recorded flights, as its Crazyflie comes?
+"""How well do simulators reproduce recorded flights, each with its own parameters of the Crazyflie?
 
-The open loop of `jaxdrones score`: from every state of every log a simulator is given the recorded inputs of the next
-half second, and what is printed is the mean distance from the flight after 0.1, 0.25 and 0.5 s. Ours flies in this
-process, crazyflow 0.4.0 and rotorpy 3.0.0 in an environment of their own (venv.py, rivals_reality.py).
+The open-loop test of `jaxdrones score`: from every state of every log a simulator receives the recorded inputs of the
+next half second, and the results are the mean errors after 0.1, 0.25 and 0.5 s. jaxdrones runs in this process,
+crazyflow 0.4.0 and rotorpy 3.0.0 in a separate environment (rivals/environment.py, rivals/reality.py).
 
-  vehicles  Each simulator has its own public numbers of the Crazyflie that flew: the brushless one where the log has
-            rotor speeds (`cf21_brushless`, cf21B_500, crazyfliebrushless_params), the 2.1 where it has PWM (`cf21` and
-            cf2x_P250 with the propellers of the 2.1+, crazyflie_params). `cf21` and `cf21_brushless` are crazyflow's
-            numbers in our model; `cf2x` is that of gym-pybullet-drones. `--vehicle` adds others of ours, for example
-            those that `jaxdrones fit` found.
-  start     The logged state. Rotors turn as measured, or have followed the commands of the 0.3 s before.
-  input     Measured rotor speeds, without a lag, each held for 0.01 s. crazyflow, whose rotors have inertia, gets them
-            on straight lines from half a row before to half a row after, whose slope is the rate that ours is given,
-            within its limits (21,661 RPM). PWM and voltage are no input of the rivals: everybody gets the thrust that
-            the firmware's curve of the 2.1+ gives them, the rivals as the speed that has it on their own thrust curve,
-            and has its own lag.
-  steps     Ours: the midpoint rule at 100 Hz. crazyflow: its default, explicit Euler, at 500 Hz. rotorpy: rk4 at
-            100 Hz, of which its default, dopri5, differs by less than a thousandth.
+  vehicles  Each simulator has its own published parameters of the Crazyflie in the log: the brushless one for logs with
+            rotor speeds (`cf21_brushless`, cf21B_500, crazyfliebrushless_params), the 2.1 for logs with PWM (`cf21` and
+            cf2x_P250 with the propellers of the 2.1+, crazyflie_params). `cf21` and `cf21_brushless` have crazyflow's
+            parameters in our model; `cf2x` is that of gym-pybullet-drones. `--vehicle` adds others, for example
+            vehicles fitted by `jaxdrones fit`.
+  start     The logged state. Rotors have the measured speeds, or have followed the commands of the previous 0.3 s.
+  input     Measured rotor speeds, without lag, each constant for 0.01 s. crazyflow, whose rotors have inertia, receives
+            them linearly interpolated from half a row before to half a row after; jaxdrones receives the same rate.
+            crazyflow limits them to 21,661 RPM. The other simulators do not accept PWM and voltage, so all receive the
+            thrust of the firmware's curve of the 2.1+, the others as the rotor speed for it on their own thrust
+            curve, and each has its own lag.
+  steps     jaxdrones: the midpoint rule at 100 Hz. crazyflow: its default, explicit Euler, at 500 Hz. rotorpy: rk4 at
+            100 Hz, which differs from its default, dopri5, by less than a thousandth.
 
-The closed loop is not compared. The flights were flown by the firmware's PID with its battery and its state estimate;
-crazyflow has the firmware's Mellinger controller and rotorpy a geometric one, neither has the other three.
+The closed loop is not compared: the flights have the firmware's PID, battery and state estimate, of which crazyflow
+(with the firmware's Mellinger controller) and rotorpy (with a geometric one) have none.
 """
 
 import argparse

@@ -1,10 +1,11 @@
 """Does self-play teach drones to race without collisions, and what does it cost in lap time?
 
-Two drones (`--drones`) race on random tracks in each other's downwash and with contact, all flown by one policy.
-Policies: `alone`, trained with one drone; `blind`, the same with opponents out of sight also in the races; `self-play`,
-with the present policy on all drones; `league`, against past policies of the same training. `completed`: drones that
-passed all gates; `collided`: races in which two drones touched, also between control steps; `lap`: time of the drones
-that completed; `overtakes` per race. The 95 % intervals are over distinct races. Every policy also flies alone.
+Two drones (`--drones`) race on random tracks with downwash and contact; one policy flies all of them. Policies:
+`alone`, trained with one drone; `blind`, the same policy, which does not observe opponents in the races either;
+`self-play`, with the current policy on all drones in training; `league`, against past policies of the same training.
+`completed`: drones that passed all gates; `collided`: races with a contact between two drones, including between
+control steps; `lap`: mean lap time of drones that completed; `overtakes` per race. The 95 % intervals are over distinct
+races. Every policy also flies alone.
 """
 
 import argparse

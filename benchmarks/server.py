@@ -1,8 +1,8 @@
-"""Measure the programs of programs.py on request, in a process of its own; what against.py compares commits with.
+"""Measure the programs of programs.py on request, in a separate process, for against.py.
 
-The first line that it writes has the definitions of all rows, as JSON. Then it answers each line that it reads with one
-line, `{"seconds": ...}` or `{"error": ...}`: `prepare NAME` compiles a program if need be, `NAME` measures its time,
-`NAME, compile` compiles it anew.
+The first line of its output has the definitions of all rows, as JSON. Then it answers each line of input with one line,
+`{"seconds": ...}` or `{"error": ...}`: `prepare NAME` compiles a program if necessary, `NAME` measures its time, and
+`NAME, compile` compiles it again.
 """
 
 import functools

@@ -1,6 +1,6 @@
-"""How long until the first step: import, and the first compiled step of a fresh process?
+"""How long do the import and the first compiled step take?
 
-Each measurement is a process of its own, without a compilation cache; the kinds take turns.
+Each measurement is a separate process without a compilation cache; the kinds are measured alternately.
 """
 
 import argparse

@@ -1,11 +1,10 @@
-"""How well does the error-state Kalman filter know the tilt of a Crazyflie that really flew?
+"""How accurately does the Kalman filter estimate the tilt in flights of a real Crazyflie?
 
-Flights of NanoBench (Ullah and Baca 2026, arXiv 2603.09908): the log of the onboard IMU at 100 Hz, whose gaps (radio
-link) are filled by straight lines, and Vicon's poses. The filter gets the IMU and Vicon's position; the error is that
-against Vicon's attitude, in the air. Two things stand between them that are not the filter's: the attitude at which the
-markers were declared level, a constant of each flight, and the errors of Vicon's attitude. For the latter, Vicon's
-position gives an acceleration, and with the IMU's small lateral force a tilt without any filter: the last column says
-how far Vicon's attitude is from Vicon's own acceleration.
+Flights of NanoBench (Ullah and Baca 2026, arXiv 2603.09908): the log of the onboard IMU at 100 Hz, with gaps of the
+radio link filled by linear interpolation, and Vicon's poses. The filter uses the IMU and Vicon's position; the error is
+relative to Vicon's attitude, in flight. Two contributions are not errors of the filter: the attitude at which the
+markers were defined as level, constant in each flight, and the errors of Vicon's attitude. To estimate the latter, the
+last column compares Vicon's attitude with the tilt from Vicon's acceleration and the small lateral force of the IMU.
 """
 
 import argparse

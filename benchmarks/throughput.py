@@ -1,6 +1,7 @@
-"""How many drone-steps per second does the explicit backend make, forward, and forward with backward?
+"""How many drone-steps per second does the explicit backend simulate, forward and with the gradient?
 
-A world is one drone with constant rotor speeds of its own. One dispatch flies many steps. The first call compiles.
+A world is one drone with constant rotor speeds, different in every world. One call simulates many steps. The first call
+compiles.
 """
 
 import argparse

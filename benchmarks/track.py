@@ -1,10 +1,10 @@
-"""How fast is each of a fixed set of programs, commit by commit?
+"""How fast is each of a fixed set of programs, commit by commit, and against another commit in the same run?
 
 Times of the plant, teams, environments, updates of the learners and a camera, 1,024 worlds each, and of compiling the
-updates; benchmarks/programs.py has them. The result of a commit on a machine is a line of JSON in
-benchmarks/results/track.jsonl; all lines of this machine are drawn as a figure. `--against COMMIT` compares with that
-commit in the same run instead, which a machine with other work does not disturb (benchmarks/against.py), and ends with
-exit code 1 if a program lost more than 30 % of its speed in all rounds.
+updates (benchmarks/programs.py). The result of a commit on a machine is a line of JSON in
+benchmarks/results/track.jsonl; a figure shows all lines of this machine. `--against COMMIT` instead compares with that
+commit in the same run, which is robust against other programs (benchmarks/against.py), and ends with exit code 1 if a
+program lost more than 30 % of its speed in all rounds.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""Does a policy trained with the realistic preset fly a plant that it has not seen?
+"""Do policies trained with `realistic` fly plants that were not in the training?
 
-Hover policies are trained on our plant and flown, with their weights frozen, on
-  own        our plant with the realistic preset: lag, drag, delay, noise, parameters drawn per episode;
+Hover policies are trained in jaxdrones and flown without further training on
+  own        jaxdrones with `realistic`: lag, drag, delay, noise, random parameters in every episode;
   delay      the same with a delay of 0, 10, 20, 30 and 40 ms in all episodes;
-  bullet     the same with Bullet as integrator, with contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s;
-             25 drones, 3 m apart, share a world;
-  crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
-             environment of its own. Delay and noise are the preset's. An action asks for the same share of the hover
-             speed as in training: the environment knows only mass and hover speed of the airframe.
+  bullet     the same with Bullet, contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s; 25 drones, 3 m
+             apart, share a world;
+  crazyflow  crazyflow 0.4.0, in a separate environment: its airframes, thrust curves, rotors, drag, rate and
+             integrator, with the delay and noise of `realistic`. An action commands the same fraction of the hover
+             speed as in training: the environment uses only mass and hover speed of the airframe.
 Starts, observations, delay, noise and the criterion (within 5 cm and 0.1 m/s for the last two of five seconds) are
-computed by one and the same code: an environment whose physics is exchanged. Before crazyflow counts, four constant
-rotor speeds must give the same flight there and here.
+computed by the same code, an environment with other physics. The result for crazyflow counts only if constant rotor
+speeds give the same flight in both simulators.
 """
 
 import argparse

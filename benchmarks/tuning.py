@@ -1,9 +1,9 @@
-"""How much closer does a vehicle follow curves with the gains that `jd.optimal.tune` finds?
+"""How much do the gains of `optimal.tune` improve tracking?
 
-A vehicle with lagging rotors and drag flies three curves that are not among those of the tuning, and to a place 0.7 m
-away, with a controller at 500 Hz, for 8 s each. It starts with the motion of the curve, level. Before: with the gains
-from which the tuning starts, those of the controller, scaled to the vehicle where they depend on it. The first tuning
-with a controller compiles.
+A vehicle with lagging rotors and drag flies three curves that were not used for tuning, and to a point 0.7 m away, with
+a controller at 500 Hz, for 8 s each. It starts level, with the velocity of the curve. Results before tuning are with
+the initial gains: those of the controller, scaled to the vehicle if they depend on it. The first tuning with a
+controller includes compilation.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""How many frames per second does the viewer's page draw without a graphics processor?
+"""How many frames per second does the page of the viewer draw without a GPU, for recorded and for simulated flights?
 
-Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium that draws in software, in a
-window of 1,100 x 720 pixels. `simulated` ones are not recorded: the page computes their physics at 500 Hz and the
-policy of hover at 100 Hz. The page lowers the resolution of the view while frames take longer than 1/32 s; `share` is
-what is left of it along each side. `CPU ms` is the processor time of all processes of the browser for a frame at half
-of the resolution along each side; other programs on the cores hardly change it. Beside it the size of the page and the
-seconds to make and to load it.
+Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium with software rendering, in a
+window of 1,100 x 720 pixels. In `simulated` flights the page computes the physics at 500 Hz and the policy of hover at
+100 Hz. The page lowers the resolution of the view while frames take longer than 1/32 s; the resolution is reported
+along each side. `CPU ms` is the CPU time of all processes of the browser for a frame at half of the resolution along
+each side; it hardly depends on other programs. The size of the page and the times to make and to load it are also
+measured.
 """
 
 import argparse

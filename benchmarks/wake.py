@@ -1,9 +1,9 @@
-"""Does the gradient through the downwash of other drones help a team to keep its altitude in their wakes?
+"""Does the gradient through the downwash of other drones help a team to keep its altitude?
 
-The task `wake`: drones cross below each other. Policies: `full`, by BPTT through the downwash; `stopped`, the same with
-constant neighbors in the derivative of the downwash; `blind to physics`, trained without downwash; `ppo`, for the time
-that `full` takes. All are flown in the downwash, from the same starts. `altitude` is the root mean square of the error
-of the altitude after the first second, mean over drones and episodes.
+In the task `wake` drones cross below each other. Policies: `full`, by BPTT with the gradient of the downwash;
+`stopped`, the same with neighbors constant in the gradient of the downwash; `blind to physics`, trained without
+downwash; `ppo`, by PPO with `--ppo-updates`. All are flown with downwash from the same starts. `altitude` is the root
+mean square altitude error after the first second, averaged over drones and episodes.
 """
 
 import argparse

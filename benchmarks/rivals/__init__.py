@@ -1,1 +1,1 @@
-"""Other simulators, run in an environment of their own."""
+"""Other simulators, run in a separate environment."""

@@ -1,6 +1,6 @@
-"""The flights of crazyflow, rotorpy and l2f for agreement.py, which runs this in their environment (venv.py).
+"""Flights of crazyflow, rotorpy and l2f for benchmarks/agreement.py, which runs this in their environment.
 
-Each flies its own vehicle, or ours with the numbers that it takes, by its own default integrator.
+Each has its own vehicle, or ours with the parameters that it accepts, and its own default integrator.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def flight_of(params: jd.Params) -> tuple[jd.State, np.ndarray]:
 def of_crazyflow() -> dict:
     """Its cf2x_P250 beside our cf21, whose numbers are from there."""
     from crazyflow.dynamics import Dynamics, load_params
-    from rivals_crazyflow import make_sim, make_step
+    from benchmarks.rivals.crazyflow import make_sim, make_step
 
     params = jd.load_params("cf21")
     start, tape = flight_of(params)

@@ -1,4 +1,4 @@
-"""Depth images of crazyflow 0.4.0, which casts a ray by MJX for every pixel; see cameras.py."""
+"""Depth images of crazyflow 0.4.0, which casts an MJX ray for every pixel; see benchmarks/cameras.py."""
 
 import argparse
 import json

@@ -1,7 +1,7 @@
 """crazyflow's first-principles plant as a step of this library; runs where crazyflow is installed.
 
 Both give `pos`, `vel` and `quat` (x, y, z, w) in world axes, the angular velocity in body axes and rotor speeds in RPM,
-and number the rotors alike: `agreement` holds them to that.
+and number the rotors in the same order; `agreement` verifies this.
 """
 
 import jax

@@ -1,7 +1,7 @@
-"""crazyflow at its best: its compiled step over all worlds, many steps in one program, commands and vehicle as data.
+"""crazyflow in its fastest form: a compiled step of all worlds, many steps a program, commands and vehicle as data.
 
-The vehicle of the plant is ours, told in crazyflow's words; its floor, motor limits and disturbances stay in its
-pipeline, as they do for its users.
+The vehicle is ours, converted to the parameters of crazyflow; its floor, motor limits and disturbances stay in its
+pipeline, as for its users.
 """
 
 from collections.abc import Callable, Sequence

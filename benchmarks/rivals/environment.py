@@ -1,6 +1,6 @@
-"""An environment in which rivals and this library live together: `.venv-rivals`, made once, which git does not see.
+"""Environment with other simulators and jaxdrones, `.venv-rivals`, made once and ignored by git.
 
-Rivals pin their own versions of jax, so the project's environment cannot hold them.
+The simulators pin their own versions of jax, so they cannot be in the environment of the project.
 """
 
 import json

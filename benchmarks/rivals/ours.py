@@ -1,4 +1,4 @@
-"""Our plant as the benchmarks of rivals and of the limit fly it, by the public API."""
+"""Plant of jaxdrones for the comparisons with other simulators and with C, by the public API."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,6 +1,6 @@
-"""Races crazyflow and rotorpy against this library in one process, in the environment of the rivals (venv.py).
+"""Measure crazyflow, rotorpy and jaxdrones in one process, in the environment of the other simulators.
 
-`rivals.py` starts it and says what the races are. In each, all contenders get the same starts and commands.
+benchmarks/race.py starts it and describes the races. In each, all simulators receive the same starts and commands.
 """
 
 import argparse

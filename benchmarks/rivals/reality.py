@@ -1,8 +1,8 @@
-"""crazyflow and rotorpy from every state of flight logs, for reality.py, which runs this in their environment.
+"""crazyflow and rotorpy from every state of flight logs, for benchmarks/reality.py, run in their environment.
 
-Of a log with rotor speeds they get these, and their own lag is left out: crazyflow's rotors come to the next speed in
-one of its steps, rotorpy's are set to it in every row. Of a log with PWM and voltage they get, in every row, the speed
-that has the firmware's thrust on their own thrust curve, and follow with their own lag, from 0.3 s before the start on.
+For a log with rotor speeds they receive these without their own lag: crazyflow's rotors reach the next speed in one of
+its steps, rotorpy's are set to it in every row. For a log with PWM and voltage they receive, in every row, the speed
+for the firmware's thrust on their own thrust curve, and follow it with their own lag, from 0.3 s before the start on.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Our plant with what others do differently, a feature at a time, and how far it then flies from them.
+"""Plant of jaxdrones with the features of other simulators, one at a time, and the remaining differences.
 
-A `Setup` is what a plant of ours is made of, a cause a change of it. `attribution` flies ours as it comes, with all
-causes, and with all but one: what a cause is worth is the difference that is left without it.
+A `Setup` has the parts of our plant, and a cause changes one of them. `attribution` simulates the plant with defaults,
+with all causes, and with all but one: the effect of a cause is the difference that remains without it.
 """
 
 import dataclasses

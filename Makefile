@@ -4,31 +4,31 @@ BIN := .venv/bin
 
 .PHONY: fly train rllib sb3 tables betaflight crazyflie test test-slow test-libraries test-rllib test-ros2 lint docs notebooks viewer
 
-fly: .venv/installed  ## four Crazyflies on the paper's circle
+fly: .venv/installed  ## four Crazyflies on the circle of gym-pybullet-drones (2021)
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
 
-train: .venv/installed  ## full four-motor hover, by the gradient of the simulation; then one flight of it
+train: .venv/installed  ## train a policy for hover, and fly it
 	@# An earlier run is kept: it moves to runs/hover-DATE-TIME.
 	if [ -e runs/hover ]; then mv runs/hover runs/hover-$$(date +%Y%m%d-%H%M%S); fi
 	$(BIN)/jaxdrones train hover --output runs/hover
 	$(BIN)/jaxdrones fly --policy runs/hover
 
-rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three seeds, and a flight of the best
+rllib: .venv-rllib/installed  ## leader and follower of gym-pybullet-drones (2021) by RLlib, three seeds, and a flight of the best
 	.venv-rllib/bin/python examples/rllib_leader_follower.py --output runs/leader-follower-rllib
 	.venv-rllib/bin/jaxdrones fly --policy runs/leader-follower-rllib
 
-sb3: .venv-libraries/installed  ## the paper's one-dimensional hover by Stable-Baselines3, and a flight of the policy
+sb3: .venv-libraries/installed  ## one-dimensional hover of gym-pybullet-drones (2021) by Stable-Baselines3, and a flight of the policy
 	.venv-libraries/bin/python examples/sb3_hover.py --output runs/hover-2021-sb3
 	.venv-libraries/bin/jaxdrones fly --policy runs/hover-2021-sb3
 
-betaflight: .venv/installed  ## build Betaflight (GPL-3.0) in the user's cache, unless it is there, and fly with it; needs gcc and make
+betaflight: .venv/installed  ## build Betaflight (GPL-3.0) in the user's cache, unless it exists, and fly with it; needs gcc and make
 	$(BIN)/jaxdrones betaflight --build --if-missing
 	$(BIN)/pytest tests/firmware -k betaflight
 
-crazyflie: .venv/installed .venv-crazyflie/installed  ## install cflib (GPL-2.0) in an environment of its own, and fly the simulated Crazyflie by it
+crazyflie: .venv/installed .venv-crazyflie/installed  ## install cflib (GPL-2.0) in a separate environment, and fly the simulated Crazyflie with it
 	$(BIN)/pytest tests/firmware -k "cflib or crazyflie"
 
-tables: .venv/installed  ## the measured tables of the pages, again; on idle cores
+tables: .venv/installed  ## measure the tables of the pages again; on idle cores
 	$(BIN)/python -m benchmarks.tables
 
 test: .venv/installed
@@ -37,13 +37,13 @@ test: .venv/installed
 test-slow: .venv/installed  ## all of them, or a part: make test-slow ONLY="--shard 2/6 --since '3 hours ago'"
 	$(BIN)/pytest -n 2 --dist load -m slow $(ONLY)
 
-test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax and JaxMARL, in an environment of their own
+test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax and JaxMARL, in a separate environment
 	.venv-libraries/bin/pytest tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)
 
 test-rllib: .venv-rllib/installed
 	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/test_examples.py -k rllib
 
-test-ros2: .venv-ros2/installed  ## a node in a real graph of ROS 2, with rclpy, in an environment of its own
+test-ros2: .venv-ros2/installed  ## ROS 2 tests with rclpy, in a separate environment
 	.venv-ros2/bin/pytest tests/ros2/test_rclpy.py tests/ros2/test_crazyswarm.py tests/ros2/test_serialization.py
 
 lint: .venv/installed
@@ -57,7 +57,7 @@ docs: .venv/installed  ## the site, into build/site; no network; a warning or a 
 notebooks: .venv/installed  ## notebooks/*.ipynb with outputs, from notebooks/*.py; needs Chromium for pictures of the viewer
 	$(BIN)/python notebooks/build.py
 
-viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothing else does
+viewer:  ## the page of the viewer, from its sources; needs Node.js
 	cd viewer && npm ci --no-audit --no-fund && npm run build
 
 .venv/installed: pyproject.toml constraints.txt

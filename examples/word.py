@@ -1,10 +1,10 @@
-"""A thousand drones write a word in the sky, flown by a policy that eight drones learned.
+"""A thousand drones form a word in the sky, with a policy trained with eight drones.
 
     jaxdrones train crowd
     python examples/word.py --word JAX --drones 1000
 
-The policy of `crowd` flies every drone to its point of the word, and keeps clear of the others. The page of the flight
-is word.html, its success on standard output.
+The policy of `crowd` flies every drone to its point of the word without contact. The script writes a page of the flight,
+word.html, and prints its success.
 """
 
 import argparse

@@ -16,8 +16,8 @@ _ONE = (
     "      show_root_heading: true\n"
 )
 _ROOT = (
-    "The names in `jaxdrones` itself come from the modules here and in the rooms: `jaxdrones.make_step`, for example, "
-    "from `jaxdrones.engine.explicit`.\n\n"
+    "The names in `jaxdrones` itself come from the modules on this page and in the subpackages: `jaxdrones.make_step`, "
+    "for example, comes from `jaxdrones.engine.explicit`.\n\n"
 )
 
 

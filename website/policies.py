@@ -2,7 +2,7 @@
 
     python website/policies.py [NAME ...]
 
-Finished trainings in runs/policies are kept, so that a stopped run goes on. It takes about an hour on one core.
+Finished trainings in runs/policies are kept, so that an interrupted run can continue. It takes an hour on one core.
 """
 
 import json

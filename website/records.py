@@ -12,7 +12,7 @@ sys.path.append(str(Path(__file__).parent.parent))
 from benchmarks.leaderboard import percent
 from benchmarks.leaderboard_scenarios import SCENARIOS
 
-_HEAD = ["scenario", "", "record", "success [95 % interval]", "tuned or trained in", "a command", "equal"]
+_HEAD = ["scenario", "", "record", "success [95 % interval]", "tuning or training", "time per command", "tied"]
 Row = dict[str, Any]
 
 
@@ -27,9 +27,9 @@ def section(root: Path, task: str) -> str:
     lines = [_HEAD, ["---"] * len(_HEAD), *(_cells(name, first) for name, first in firsts.items())]
     return "\n".join(
         [
-            "Of each scenario of the [leaderboard](../leaderboard.md), the pilots with the highest lower bound of the "
-            f"success. Times are processor times, at commit {about['commit']} on {about['cores']} cores of "
-            f"{about['cpu']}. A row is measured again by:",
+            "The table has the pilots with the highest lower bound of the success rate in each scenario of the "
+            f"[leaderboard](../leaderboard.md). Times are CPU times, at commit {about['commit']} on {about['cores']} "
+            f"cores of {about['cpu']}. This command measures a row again:",
             "",
             "```sh",
             f"python -m benchmarks leaderboard --pilot {known['pilot']} --scenario {known['scenario']}",
@@ -41,7 +41,7 @@ def section(root: Path, task: str) -> str:
 
 
 def best(rows: Sequence[Row]) -> list[Row]:
-    """Rows with the highest lower bound of the success, those that took least time first; none if nobody succeeds."""
+    """Rows with the highest lower bound of the success rate, the fastest first; none if no pilot succeeds."""
     bounds = [row["interval"][0] if row["interval"] else row["success"] for row in rows]
     first = [row for row, bound in zip(rows, bounds, strict=True) if bound == max(bounds) and row["success"] > 0]
     return sorted(first, key=lambda row: row["seconds to obtain"] or math.inf)
@@ -51,7 +51,7 @@ def _cells(scenario: str, first: Sequence[Row]) -> list[str]:
     """Cells of one scenario, with its best rows."""
     about = [f"`{scenario}`", SCENARIOS[scenario].text]
     if not first:
-        return [*about, "nobody", "0 %", "", "", ""]
+        return [*about, "none", "0 %", "", "", ""]
     row, *others = first
     interval = f" [{percent(row['interval'][0])}, {percent(row['interval'][1])}]" if row["interval"] else ""
     return [

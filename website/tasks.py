@@ -14,7 +14,7 @@ from jaxdrones.training.presets import default_algorithm, settings_known
 from jaxdrones.training.run import Run
 
 _NUMBERS = "Entries are in their unit, unless the last columns have the values at -1, 0 and 1."
-_ONE_DRONE = "Of each drone, in each control step."
+_ONE_DRONE = "The table has the entries of one drone."
 
 
 def pages(root: Path) -> dict[str, str]:
@@ -38,15 +38,17 @@ def _page(name: str, picture: str | None, measured: str, record: str) -> str:
         *([f"![{_shown(picture)}](../images/tasks/{picture})"] if picture else []),
         _table(["", ""], team),
         f"```sh\njaxdrones explain {name}\n{_training(name)}\n{_flight(name)}```",
-        f"## What was measured\n\n{_bundled(name)}{measured}",
+        f"## Results\n\n{_bundled(name)}{measured}",
         *([f"## Records\n\n{record}"] if record else []),
         f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(table.observation)}",
         *([f"## Images\n\n{_table(['image', ''], table.images.items())}"] if table.images else []),
         f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(table.action)}",
-        f"## Reward\n\nThe sum of weight times term. {_ONE_DRONE}\n\n{_parts(table.rewards)}",
-        "## Ends\n\nAn episode terminates if one condition holds for one drone; truncations cut an episode short."
+        "## Reward\n\nThe reward of a drone in a control step is the sum of weight times term.\n\n"
+        f"{_parts(table.rewards)}",
+        "## Terminations and truncations\n\nA termination ends an episode in a state without future reward; a truncation "
+        "cuts it off."
         f"\n\n{_parts(table.terminations, 'termination')}\n\n{_parts(table.truncations, 'truncation')}",
-        f"## Metrics\n\nReported, without reward.\n\n{_parts(table.metrics, 'metric')}",
+        f"## Metrics\n\nMetrics are reported and have no reward.\n\n{_parts(table.metrics, 'metric')}",
         f"## Physics\n\n{_table(['', ''], table.physics.items())}",
     ]
     return "\n\n".join(sections) + "\n"
@@ -67,7 +69,7 @@ def _flight(name: str) -> str:
 
 
 def _bundled(name: str) -> str:
-    """What the report of the bundled policy says."""
+    """Results of the bundled policy from its report."""
     if name not in assets.policies():
         return ""
     report = Run(assets.policies()[name]).report() or {}
@@ -87,7 +89,7 @@ def _measured(name: str, results: str) -> str:
     own = [row for row in rows.splitlines(keepends=True) if re.match(rf"\| `{name}`[ ,]", row)]
     if not own:
         return "" if name in assets.policies() else "Not measured."
-    return f"On 2 shared CPU cores; see [Train a policy](../training.md#results).\n\n{head}{''.join(own)}"
+    return f"Measured on 2 shared CPU cores ([Train a policy](../training.md#results)):\n\n{head}{''.join(own)}"
 
 
 def _entries(entries: Sequence[Entry]) -> str:

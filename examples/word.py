@@ -3,8 +3,8 @@
     jaxdrones train crowd
     python examples/word.py --word JAX --drones 1000
 
-The policy of `crowd` flies every drone to its point of the word without contact. The script writes a page of the flight,
-word.html, and prints its success.
+The policy of `crowd` flies every drone to its point of the word without contact. The script writes a page of the
+flight, word.html, and prints its success.
 """
 
 import argparse

@@ -45,8 +45,8 @@ def _page(name: str, picture: str | None, measured: str, record: str) -> str:
         f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(table.action)}",
         "## Reward\n\nThe reward of a drone in a control step is the sum of weight times term.\n\n"
         f"{_parts(table.rewards)}",
-        "## Terminations and truncations\n\nA termination ends an episode in a state without future reward; a truncation "
-        "cuts it off."
+        "## Terminations and truncations\n\nA termination ends an episode in a state without future reward; "
+        "a truncation cuts it off."
         f"\n\n{_parts(table.terminations, 'termination')}\n\n{_parts(table.truncations, 'truncation')}",
         f"## Metrics\n\nMetrics are reported and have no reward.\n\n{_parts(table.metrics, 'metric')}",
         f"## Physics\n\n{_table(['', ''], table.physics.items())}",

@@ -194,9 +194,7 @@ class _Urdf:
         for rotor in _ROTORS:
             parent = self._tag(f"joint[@name='{rotor}']/parent")
             if parent is not None and parent.get("link") != "base_link":
-                raise UserError(
-                    f"{self.name}: {rotor} is attached to {parent.get('link')!r}; attach it to base_link"
-                )
+                raise UserError(f"{self.name}: {rotor} is attached to {parent.get('link')!r}; attach it to base_link")
         origin, collision = f"{_BASE}/inertial/origin", f"{_BASE}/collision/origin"
         upright = "rotors push along body z; give no roll and pitch"
         for path, attribute, count, remedy in (

@@ -59,6 +59,7 @@ def flight_of(params: jd.Params) -> tuple[jd.State, np.ndarray]:
 def of_crazyflow() -> dict:
     """Its cf2x_P250 beside our cf21, whose numbers are from there."""
     from crazyflow.dynamics import Dynamics, load_params
+
     from benchmarks.rivals.crazyflow import make_sim, make_step
 
     params = jd.load_params("cf21")

@@ -182,7 +182,7 @@ def pid_gains() -> Action:
             return Action(6, command, pid.init, entries=entries)
         raise UserError(
             f"the action type 'pid_gains' scales the gains of the PID, which suit only {', '.join(pid.VEHICLES)} "
-                "and vehicles with similar parameters; give one of these, or another action type"
+            "and vehicles with similar parameters; give one of these, or another action type"
         )
 
     return Action(6, command, pid.init, for_vehicle, entries)

@@ -158,7 +158,7 @@ def test_the_status_tells_whether_it_is_armed_and_why_not():
 
 @pytest.mark.parametrize("data", [b"", STATUS, STATUS + b"\x0f", STATUS + b"\0\x1d\0\0"])
 def test_a_status_of_another_version_is_a_lack_of_an_answer(data):
-    with pytest.raises(msp.NoAnswer, match="version 4.6"):
+    with pytest.raises(msp.NoAnswer, match=r"version 4\.6"):
         settings.parse_status(data)
 
 

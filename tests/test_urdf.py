@@ -120,7 +120,7 @@ def test_a_missing_file_says_what_to_give(tmp_path):
             r"drag takes 3.37e\+03 of the speed per second; expected at most",
         ),
         ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 1 1"', r"spin in hover; give two rotors each direction"),
-        ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 -1 1"', r'rotor_spin="1 1 -1 1" makes a drone that spins'),
+        ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 -1 1"', r'rotor_spin="1 1 -1 1" makes the drone spin'),
         ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 -1 -1"', r"cannot rotate the drone about every axis; place them"),
         (
             'izz="2.17e-5"',

@@ -64,7 +64,7 @@ MISTAKES = [  # (what stands in the file, what a user wrote in its place, what i
     ("return Task(", "return unknown\n    Task(", r"\(mine\) raises NameError: name 'unknown' is not defined"),
     ("import jax,", "import sys; sys.exit(0)\nimport jax,", r"raises SystemExit\(0\); .* must not exit the program"),
     ("import jax,", "raise SystemExit\nimport jax,", r"raises SystemExit\(None\)"),
-    ("import jax,", "import no_such_library\nimport jax,", "No module named 'no_such_library'; a file of yours may"),
+    ("import jax,", "import no_such_library\nimport jax,", "No module named 'no_such_library'; your file may"),
     ("import jax,", "from jaxdrones import Stat\nimport jax,", r"cannot import name 'Stat' from 'jaxdrones' \(.*\)\n"),
     ("def start(", "def start(:\ndef start(", "line 6 raises SyntaxError"),
     ("def mine", "def mein", "defines no 'mine'; did you mean 'mein'?"),

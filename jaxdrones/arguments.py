@@ -57,7 +57,7 @@ def choice(kind: str, known: Iterable[str]) -> Check:
 
 
 def sequence(example: str, each: Check | None = None) -> Check:
-    """Sequence, of which `example` is an entry, and every entry passes the check `each`."""
+    """Check of a sequence whose entries pass the check `each`; `example` is an entry, for messages."""
 
     def check(argument: str, value: Any) -> None:
         for entry in checks.check_sequence(argument, value, example):

@@ -155,7 +155,7 @@ def opened(program: Any) -> tuple[Any, list]:
 
 
 def without_dead(program: Any) -> tuple[Any, list[bool]]:
-    """Program without inputs and equations that no result depends on, and which inputs are left."""
+    """Program without inputs and equations that no result depends on, and whether each input is kept."""
     return dce_jaxpr(program, [True] * len(program.outvars))
 
 

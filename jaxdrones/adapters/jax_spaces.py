@@ -76,7 +76,7 @@ def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
 
 
 def action_table(discrete_actions: Any, size: int) -> Float[Array, "k a"]:
-    """Validated table of discrete actions, one a row."""
+    """Validated table of discrete actions, one per row."""
     table = np.asarray(discrete_actions, np.float32)
     check_shape("discrete_actions", table, ("k", size), "one row for every discrete action", finite=True)
     return jnp.asarray(table)

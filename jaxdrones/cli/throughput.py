@@ -56,7 +56,7 @@ def controlled(step: Step, params: Params, length: int, dt: float) -> Callable[[
 def episodes(env: Env, worlds: int, length: int) -> tuple[Callable[[Any, Array], Any], Any]:
     """Steps of many worlds of an environment with random actions and automatic resets.
 
-    Episodes are out of step. All inputs of a learner are stored in each step.
+    Episodes end at different steps. Every step stores all inputs of a learner.
 
     Returns:
         `fly(episodes, key)` for `length` control steps in every world, and the initial episodes.

@@ -26,10 +26,10 @@ _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 class Request(argparse.Namespace):
-    """Validated options of the command, and what follows from them.
+    """Validated options of the command, and values derived from them.
 
-    These are `settings`, those of the learner, with the `updates` of --budget, and options of the environment;
-    `seconds`, the time per run of --budget; and `row`, the settings of --sweep, for titles.
+    The derived values are `settings` (those of the learner, with the `updates` of --budget, and options of the
+    environment), `seconds` (the time per run of --budget) and `row` (the settings of --sweep, for titles).
     """
 
     @classmethod

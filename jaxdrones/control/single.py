@@ -1,4 +1,4 @@
-"""One drone and a team: annotations of arguments of one drone, which a team would broadcast; memory of a team."""
+"""Checks that reject a team where one drone is expected (it would broadcast), and the memory of a team."""
 
 from typing import Annotated, Any
 

@@ -32,7 +32,7 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     l the distance of neighboring motors; it sets in smoothly within one l below the other drone.
     A rotor loses the fraction `inflow_loss` of its thrust per m/s of flow down its own axis, so a drone halfway in the
     jet tilts; beyond one half of the thrust the loss levels off (`lost_share`). The law is valid from 2.5 l on
-    (Bauersfeld et al. 2024); nearer it is an assumption.
+    (Bauersfeld et al. 2024); at shorter distances it is an extrapolation.
     """
     per_length = 1 / (jnp.sqrt(2.0) * other.arm)
     own_axes = rotation.axes(state.quat)

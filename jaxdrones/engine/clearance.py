@@ -1,7 +1,8 @@
 """Skip obstacle contact of drones that are provably clear.
 
-The distance from the nearest obstacle is 1-Lipschitz in the position. One distance query a control step therefore gives
-a free ball around each drone, and contact is exact without any computation for as long as the drone stays in its ball.
+The distance from the nearest obstacle is 1-Lipschitz in the position. One distance query per control step therefore
+gives a free ball around each drone, and contact is exact without any computation for as long as the drone stays in
+its ball.
 """
 
 from __future__ import annotations

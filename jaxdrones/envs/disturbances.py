@@ -46,7 +46,8 @@ class DisturbanceWithMemory:
         """Parameters of a team with wind and external force of the next control step."""
         if self.name not in params.aux:
             raise UserError(
-                f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
+                f"params.aux lacks {self.name!r}, the memory of a disturbance; start with "
+                "params = disturbance.start(key, params)"
             )
         return self.advance(key, params, dt)
 

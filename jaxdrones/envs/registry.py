@@ -273,13 +273,13 @@ def _check_controller(name: str, action: Action, params: Params, lagging: bool, 
         return
     if dt > _MAX_PERIOD * (1 + 1e-6):
         raise UserError(
-            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
+            f"control_hz is {1 / dt:g}; the action type {name!r} uses a controller that needs "
             f"{1 / _MAX_PERIOD:g} or more"
         )
     time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
     if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
         raise UserError(
-            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
-            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
+            f"the action type {name!r} uses a controller that needs rotors with a time constant of up to "
+            f"{_MAX_ROTOR_TIME} s; this vehicle has {time:.2g} s; give rotors='instant', or an "
             "action type that commands rotors, thrust and torques, or rates"
         )

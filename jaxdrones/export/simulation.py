@@ -78,7 +78,7 @@ def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of
     """Simulation of the nominal vehicle of an environment, which a policy or controllers fly to a target.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
-    external force (N, world). The drones fly without influence on each other, each at its own goal.
+    external force (N, world). The drones do not interact; each flies to its own goal.
 
     Raises:
         ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.

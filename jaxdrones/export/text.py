@@ -31,7 +31,7 @@ class Description:
     """Bytes of working memory and hidden state, of targets that manage their own memory."""
 
     def lines(self) -> list[str]:
-        """Text of inputs and outputs, a table row a line."""
+        """Text of inputs and outputs, one line per row of a table."""
         text = [
             f"{self.title}: deterministic policy of one drone, written by `jaxdrones export`.",
             f"Call it {1 / self.period:g} times per second.",

@@ -66,7 +66,7 @@ def on_ground(params: Params, x: float = 0.0, y: float = 0.0) -> State:
 
 
 def set_upright(params: Params, state: State) -> State:
-    """State of a team of one on the ground below it, upright and at rest, with the states of its models."""
+    """State of one drone (a team of one), moved upright and at rest to the ground below it; model states stay."""
     x, y, _ = np.asarray(state.pos[0]).tolist()
     same = ("pos", "quat", "vel", "omega", "rpm")
     start = on_ground(params, x, y)

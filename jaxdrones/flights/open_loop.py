@@ -66,7 +66,9 @@ def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
     flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
     starts = np.flatnonzero(flying)[::stride]
     if not len(starts):
-        raise UserError(f"{log.name}: the motors never run for {_LENGTH * PERIOD:g} s on end; give a log of a flight")
+        raise UserError(
+            f"{log.name}: the motors never run for {_LENGTH * PERIOD:g} s without interruption; give a log of a flight"
+        )
     return starts
 
 

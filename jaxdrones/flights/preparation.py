@@ -45,7 +45,7 @@ def prepare(log: FlightLog, allow_inconsistent: bool = False) -> list[FlightLog]
         if found := inconsistencies(one):
             raise UserError(
                 f"{one.name}: {'; '.join(found)}; repair the log, or pass allow_inconsistent=True "
-                "(--allow-inconsistent) to take it as it is"
+                "(--allow-inconsistent) to accept it"
             )
     return drones
 

@@ -49,7 +49,7 @@ _POINT = shape(3, meaning="m, world")
 def render(scene: AnalyticScene, params: Params, state: TeamState, camera: OneCamera = _DEFAULT) -> Images:
     """Render the camera of every drone of a team, of which only the poses matter; all drones have the same camera.
 
-    One ray a pixel is intersected with boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four
+    One ray per pixel is intersected with boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four
     rotor discs each), so the cost grows with pixels times solids. The depth is differentiable in the poses and in the
     scene: its gradient is that of the visible surface, without the contribution of moving silhouettes. Surfaces nearer
     than `near` are seen at `near`, also from inside. Under `jax.jit` unused images cost nothing.

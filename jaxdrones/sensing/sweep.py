@@ -26,7 +26,7 @@ _PLANES = 3  # of a body: a corner has three faces
 
 
 class Disc(NamedTuple):
-    """Disc that is rounded by a ball."""
+    """Disc rounded by a ball."""
 
     center: Point
     """m, world."""

@@ -28,7 +28,7 @@ def goal(variables: dict[str, Array], t: Array) -> Setpoint:
 
 
 def length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
-    """Length of every row; below `small` it is a parabola."""
+    """Smoothed length of every row, quadratic below about `small`."""
     return jnp.sqrt(square(v) + small**2) - small
 
 

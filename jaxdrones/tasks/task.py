@@ -250,7 +250,7 @@ class Task:
         return jnp.broadcast_to(reduce(x), x.shape) if self.ends == "team" else x
 
     def target_now(self, world: World) -> Setpoint:
-        """Present set-points of the team."""
+        """Current set-points of the team."""
         return self.target(world.variables, world.time)
 
 

@@ -102,8 +102,8 @@ def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0
     """Index of the policy to keep, of evaluations with the same number of episodes.
 
     It is the first one with the highest return among policies whose success rate is statistically tied for first. Two
-    success rates are tied if their Wilson intervals of one standard error overlap: for 1,000 episodes, a difference of
-    1 is a tie, and a difference of 5 is not. `highest_success` is the highest success rate of earlier evaluations; it
+    success rates are tied if their Wilson intervals of one standard error overlap: 1,000 and 999 successes in 1,000
+    episodes are tied, 1,000 and 995 are not. `highest_success` is the highest success rate of earlier evaluations; it
     keeps small losses from accumulating over selections.
     """
 

@@ -180,7 +180,7 @@ class Run:
             lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(whole)]
             rows = [{name: float(x) for name, x in line.items()} for line in lines]
             if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
-                raise UserError("a row lacks its update")
+                raise UserError("a row has no update")
         except (OSError, ValueError, TypeError, csv.Error) as error:
             why = files.one_line(error)
             raise UserError(f"{path} is damaged: {why}; remove it, training continues without its rows") from error

@@ -60,9 +60,7 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
             raise OSError("frames are missing")
         new.replace(path)
     except (OSError, RuntimeError) as error:  # RuntimeError: invalid film
-        raise OSError(
-            f"{path} cannot be written, ffmpeg broke off; is the disk full, or the folder read-only?"
-        ) from error
+        raise OSError(f"{path} cannot be written, ffmpeg failed; is the disk full, or the folder read-only?") from error
     finally:
         if writer is not None:
             writer.close()

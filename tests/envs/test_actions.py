@@ -131,7 +131,7 @@ def test_a_velocity_is_that_of_the_paper_whoever_flies():
 def test_failing_rotors_lag_as_those_that_they_wrap():
     params = jaxdrones.load_params("cf2x").replace(aux={"rotor_health": jnp.ones(4)})
     for rotors in jaxdrones.lagging_rotors, jaxdrones.failing(jaxdrones.lagging_rotors):
-        with pytest.raises(ValueError, match=r"'pid_gains' .* which lag, have 0\.15 s"):
+        with pytest.raises(ValueError, match=r"'pid_gains' .* this vehicle has 0\.15 s"):
             make("hover", vehicle=params, action="pid_gains", rotors=rotors)
 
 

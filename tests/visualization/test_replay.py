@@ -87,7 +87,7 @@ def test_a_film_that_ffmpeg_cannot_write_is_one_line_and_leaves_the_old_one(
         return counted(new)
 
     monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", count)
-    with pytest.raises(OSError, match=r"film\.mp4 cannot be written, ffmpeg broke off; is the disk full") as error:
+    with pytest.raises(OSError, match=r"film\.mp4 cannot be written, ffmpeg failed; is the disk full") as error:
         films.film(record, film, "", "bullet", fps=2, size=(320, 180))
     assert "\n" not in str(error.value) and capfd.readouterr().err == ""
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]

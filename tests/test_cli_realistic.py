@@ -57,7 +57,7 @@ def test_a_run_on_any_vehicle_says_so_and_is_evaluated_and_flown_on_any_vehicle(
 
     again = ["train", "hover", *output, "--resume"]
     assert "was started with realistic any, not True; leave realistic out" in refused(capsys, *again, "--realistic")
-    assert "is trained to the end" in refused(capsys, *again, "--realistic", "any")
+    assert "is complete (updates=" in refused(capsys, *again, "--realistic", "any")
 
 
 @pytest.mark.slow

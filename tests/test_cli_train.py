@@ -92,7 +92,7 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
     assert without_seconds(folder) == without_seconds(whole)
     capsys.readouterr()
     assert main(["train", "hover", "--output", str(folder), "--resume"]) == 2
-    assert "trained to the end" in capsys.readouterr().err
+    assert "is complete" in capsys.readouterr().err
 
 
 def contents(folder):
@@ -174,8 +174,8 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
     resume = ["train", "hover", "--output", str(folder), "--resume", "--no-figure"]
     before, best = contents(folder), tuple(Run(folder).sidecar_entry("best", "score"))
     for wrong, message in [
-        ([], "trained to the end, 4 updates; train it longer with --budget N or 60s"),
-        (["--set", "updates=4"], "trained to the end"),
+        ([], "is complete (updates=4); train longer with --budget N or 60s"),
+        (["--set", "updates=4"], "is complete (updates=4)"),
         (["--set", "updates=3"], "was started with updates 4, not 3"),
         (["--budget", "2147483647"], "updates is 2147483651; give at most"),
         (["--budget", "2", "--episodes", "9"], "was started with episodes 8, not 9"),

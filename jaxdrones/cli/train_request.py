@@ -138,7 +138,7 @@ class Request(argparse.Namespace):
         total = _total(recipe.config.updates, updates, self.budget is not None, finished)
         if finished and self.seconds is None and total == recipe.config.updates:
             raise UserError(
-                f"{folder} is trained to the end, {total} updates; train it longer with --budget N or 60s, or "
+                f"the training in {folder} is complete (updates={total}); train longer with --budget N or 60s, or "
                 "replace it with --overwrite instead of --resume"
             )
         stop_at = recipe.stop_at if self.stop_at is None else self.stop_at

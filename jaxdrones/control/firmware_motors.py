@@ -74,7 +74,7 @@ def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, "
 def mix(
     thrust: Float[Array, ""], torque: Float[Array, "3"], mixer: Float[Array, "4 3"] | None = None
 ) -> Float[Array, "4"]:
-    """Commands of the motors from thrust and torque, 16 bit, not limited; by default in the X of a Crazyflie."""
+    """Commands of the motors from thrust and torque, 16 bit, not limited; the default mixer is a Crazyflie in X."""
     shares = jnp.array(_MIXER) if mixer is None else mixer
     return jnp.stack([thrust + vector.dot(share, torque) for share in vector.components(shares)])
 

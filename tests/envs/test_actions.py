@@ -91,7 +91,7 @@ def test_hover_with_a_large_vehicle_stays_at_its_start_under_no_action(vehicle):
 
 @pytest.mark.parametrize("vehicle", ["hb", HEAVY])
 def test_gains_of_a_pid_that_does_not_suit_the_vehicle_cannot_be_scaled(vehicle):
-    with pytest.raises(ValueError, match=r"'pid_gains' scales .* suit cf2x, cf2p .* another action type"):
+    with pytest.raises(ValueError, match=r"'pid_gains' scales .* suit only cf2x, cf2p .* another action type"):
         make("hover", vehicle=vehicle, action="pid_gains")
     with pytest.raises(ValueError, match="'pid_gains' scales"):
         make("tune", vehicle=vehicle)
@@ -101,7 +101,7 @@ def test_gains_of_a_pid_that_does_not_suit_the_vehicle_cannot_be_scaled(vehicle)
 def test_what_a_controller_cannot_hold_is_refused(name):
     """A Crazyflie whose rotors lag as they do, and too few calls per second."""
     for lagging in dict(rotors="lagging"), dict(realistic=True):
-        with pytest.raises(ValueError, match=rf"'{name}' .* rotors with a time constant .* have 0\.15 s; give rotors="):
+        with pytest.raises(ValueError, match=rf"'{name}' .* rotors with a time constant .* has 0\.15 s; give rotors="):
             make("hover", action=name, **lagging)
     with pytest.raises(ValueError, match=rf"control_hz is 20; the action type '{name}' .* needs 30 or more"):
         make("hover", action=name, control_hz=20)

@@ -89,7 +89,7 @@ def open_policy(
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which determines it; leave it out")
     if not policy.exists() and not is_bundled(policy) and (close := hint(str(policy), assets.policies())):
-        raise UserError(f"{policy}/best.json does not exist, and {policy} is no bundled policy{close}")
+        raise UserError(f"{policy}/best.json does not exist, and {policy} is not a bundled policy{close}")
     run = Run(assets.policies()[str(policy)] if is_bundled(policy) else policy)
     warn_of_code(run, "last" if last else "best")
     return run

@@ -85,7 +85,7 @@ def test_noise_is_no_traceback_and_a_signal_ends_a_flight_with_its_log(simulated
         (["betaflight", "--joystick", "js", "--policy", "run"], "--policy and --joystick are given"),
         (["betaflight", "--joystick", "js", "--flip", "1"], "--flip is given beside --joystick"),
         (["betaflight", "--if-missing"], "--if-missing is given without --build"),
-        (["betaflight"], "BETAFLIGHT_SITL is nothing, which is no program; run `jaxdrones betaflight --build`"),
+        (["betaflight"], "BETAFLIGHT_SITL is nothing, not a program; run `jaxdrones betaflight --build`"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):

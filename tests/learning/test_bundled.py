@@ -47,7 +47,7 @@ def test_a_policy_succeeds_as_often_as_its_report_says(task):
 def test_a_name_that_is_nearly_that_of_a_bundled_policy_is_corrected(capsys):
     assert main(["eval", "forrest"]) == 2
     assert (
-        "forrest/best.json does not exist, and forrest is no bundled policy; did you mean 'forest'?"
+        "forrest/best.json does not exist, and forrest is not a bundled policy; did you mean 'forest'?"
         in capsys.readouterr().err
     )
 

@@ -31,7 +31,7 @@ def find_program() -> Path:
     program = Path(given) if given else cache_folder() / PROGRAM
     if program.is_file() and os.access(program, os.X_OK):
         return program
-    what = f"{VARIABLE} is {given}, which is no program" if given else f"Betaflight is not built: {program} is missing"
+    what = f"{VARIABLE} is {given}, not a program" if given else f"Betaflight is not built: {program} is missing"
     raise UserError(f"{what}; run `jaxdrones betaflight --build`, which downloads its source and needs gcc and make")
 
 

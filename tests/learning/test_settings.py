@@ -161,7 +161,7 @@ def test_a_learner_takes_its_own_settings_and_no_others(name):
     env, learner = envs.make("hover"), LEARNERS[name]
     for other, module in LEARNERS.items():
         if other != name:
-            with pytest.raises(ValueError, match=rf"config is {other}\.Config; {name} learns with .*{name}\.Config"):
+            with pytest.raises(ValueError, match=rf"config is {other}\.Config; give .*{name}\.Config"):
                 learner.train(KEY, env, module.Config())
     with pytest.raises(ValueError, match=rf"config is a dictionary; give jaxdrones\.learning\.{name}\.Config"):
         learner.train(KEY, env, dict(updates=3))

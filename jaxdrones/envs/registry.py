@@ -16,6 +16,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
 from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.physics import Physics
@@ -129,8 +130,8 @@ def make(
     nominal = equipped(task, nominal_params(randomize, nominal))
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
-    effects = [*effects, *task.effects]
-    if disturbance is not None:
+    effects = [*effects, *(effect for effect in task.effects if effect not in effects)]
+    if disturbance is not None and external_force not in effects:
         effects = [*effects, external_force]
     pairs = _all_named("pairs", task.pairs if pairs is None else pairs, PAIRS, others=EFFECTS)
     lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
@@ -150,12 +151,13 @@ def make(
             raise UserError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
         step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
-        if "ground" in task.contact:
+        touched = {needs_of(function).contact for function in (*effects, *pairs)}
+        if "ground" in task.contact and "ground" not in touched:
             physics["effects"] = [*physics["effects"], ground_contact]
         solid = example.has_obstacles and ("obstacles" in task.contact or not task.obstacles_terminate)
         if solid and not Physics(physics["effects"]).takes_scene:
             physics["effects"] = [*physics["effects"], obstacle_contact]
-        if "drones" in task.contact:
+        if "drones" in task.contact and "drones" not in touched:
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 

@@ -1,6 +1,7 @@
 """An environment is immutable; it hashes by identity and pickles by value."""
 
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
@@ -45,3 +46,20 @@ def test_replacing_a_field_keeps_what_is_drawn():
     assert len(other.draws) == len(env.draws) == 2
     for a, b in zip(*(jax.tree.leaves(e.reset(jax.random.key(1))) for e in (env, other)), strict=True):
         np.testing.assert_array_equal(a, b) if not jax.dtypes.issubdtype(a.dtype, jax.dtypes.prng_key) else None
+
+
+@pytest.mark.parametrize(
+    ("task", "kind", "given"),
+    [
+        ("landing", "effects", ("drag", "ground_contact")),
+        ("landing", "effects", (functools.partial(jd.ground_contact),)),
+        ("meetup", "pairs", ("drone_contact",)),
+        ("hover", "effects", (jd.external_force,)),
+    ],
+)
+def test_what_a_task_or_a_disturbance_brings_acts_once_where_it_is_given_too(task, kind, given):
+    contact = tuple(f for f in (jd.ground_contact, jd.drone_contact) if f.needs.contact in make(task).task.contact)
+    physics = make(task, disturbance=jd.dryden(7.7), **{kind: given}).physics.physics
+    functions = [f.func if isinstance(f, functools.partial) else f for f in (*physics.effects, *physics.pairs)]
+    for brought in (*contact, jd.external_force):
+        assert functions.count(brought) == 1

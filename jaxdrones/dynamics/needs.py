@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -34,9 +34,15 @@ def declare(needs: Needs) -> Callable[[Function], Function]:
     return declared
 
 
+def layers(function: Callable) -> Iterator[Any]:
+    """A function, and then those inside where it has bound arguments or is a wrapper, such as that of `jax.jit`."""
+    inner: Any = function
+    while inner is not None:
+        yield inner
+        inner = inner.func if isinstance(inner, functools.partial) else getattr(inner, "__wrapped__", None)
+
+
 def needs_of(function: Callable) -> Needs:
-    """Declaration of an effect, also of one with bound arguments."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    needs = getattr(function, "needs", None)
-    return needs if isinstance(needs, Needs) else Needs()
+    """Declaration of an effect, also of one with bound arguments or in a wrapper."""
+    declared = (getattr(layer, "needs", None) for layer in layers(function))
+    return next((needs for needs in declared if isinstance(needs, Needs)), Needs())

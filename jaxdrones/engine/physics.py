@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdrones.arguments import checked, sequence
 from jaxdrones.checks import bind, check_function, takes
 from jaxdrones.dynamics.model import Model
-from jaxdrones.dynamics.needs import needs_of
+from jaxdrones.dynamics.needs import layers, needs_of
 from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
@@ -192,10 +192,14 @@ class Physics:
 
 
 def _undeclared_contact(function: Callable) -> Callable | None:
-    """Contact effect that a function names without being declared as contact."""
-    if needs_of(function).contact or not inspect.isfunction(function):
+    """Contact effect that a function, a method or an object names without being declared as contact."""
+    if needs_of(function).contact:
         return None
-    named = inspect.getclosurevars(function)
-    values = [*named.nonlocals.values(), *named.globals.values()]
-    values += [vars(x).get(name) for x in values if inspect.ismodule(x) for name in named.unbound]
+    values: list[Any] = []
+    for layer in layers(function):
+        called = layer if inspect.isroutine(layer) else layer.__call__
+        if inspect.isfunction(called) or inspect.ismethod(called):
+            named = inspect.getclosurevars(called)
+            values += [*named.nonlocals.values(), *named.globals.values()]
+            values += [vars(x).get(name) for x in values if inspect.ismodule(x) for name in named.unbound]
     return next((x for x in values if callable(x) and needs_of(x).contact), None)

@@ -93,6 +93,38 @@ def test_a_function_around_contact_declares_it_or_is_refused(enclosed):
     jd.make_step(pairs=[lambda *both: jd.downwash(*both)])
 
 
+class Touching:
+    """A user's effect with contact inside."""
+
+    def __call__(self, params, state, scene):
+        return jd.obstacle_contact(params, state, scene)
+
+    def method(self, params, state, scene):
+        return jd.obstacle_contact(params, state, scene)
+
+
+def test_contact_in_any_wrapper_is_the_same_contact():
+    """That of a compiled or wrapped one is found, and that of an object is refused as that of a function is."""
+    soft = functools.partial(jd.obstacle_contact)
+    for around in jax.jit(jd.obstacle_contact), functools.partial(jax.jit(soft)), functools.wraps(soft)(Touching()):
+        assert Physics([around]).touches(SCENE)
+    with pytest.raises(ValueError, match=r"up to 1/240 s; give dt=0\.004167"):
+        jd.make_step(effects=[jax.jit(jd.ground_contact)], dt=1 / 60)
+
+    def function(params, state, scene):
+        return jd.obstacle_contact(params, state, scene)
+
+    for around in (
+        Touching(),
+        functools.partial(Touching()),
+        Touching().method,
+        functools.partial(function),
+        jax.jit(function),
+    ):
+        with pytest.raises(ValueError, match=r"calls obstacle_contact .*give functools.wraps\(obstacle_contact\)"):
+            jd.make_step(effects=[around])
+
+
 @pytest.mark.needs("pybullet")
 def test_bullet_refuses_contact_with_bound_arguments():
     with pytest.raises(ValueError, match="ground_contact is given and Bullet resolves"):

@@ -13,7 +13,7 @@ from jaxdrones import vector
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.pairs import CORE, dot, nearby, nearest_on_the_way, seen_from
+from jaxdrones.tasks.pairs import CORE, dot, nearby, nearest_on_the_way, seen_from, sums_with
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, distance
 
 SPEED = 1.2  # m/s, to the goal
@@ -53,13 +53,12 @@ def variables(state: State, goal: Float[Array, "n 3"]) -> dict[str, Array]:
 def advance(task: Task, world: World) -> dict[str, Array]:
     """Task variables after a step.
 
-    Two drones touch when they come closer than two collision radii on the way, a drone and an obstacle when the center
+    Two drones touch when they come closer than both collision radii on the way, a drone and an obstacle when the center
     of the drone is within a collision radius of it at a control step.
     """
     variables, pos = world.variables, world.drones.pos
     before = jnp.where(world.active[:, None], variables["pos"], pos)  # drones that left did not fly there
-    closest = nearest_on_the_way(before, pos, nearby(pos, _SEEN))
-    touching = closest < 2 * world.params.collision_radius
+    touching = nearest_on_the_way(before, pos, nearby(pos, _SEEN), world.params.collision_radius) < 0
     if world.scene.has_obstacles:
         touching |= shaping.gap(world) < 0
     return variables | {"pos": pos, "touched": variables["touched"] | touching}
@@ -87,7 +86,7 @@ def _approach(task: Task, world: World) -> Float[Array, " n"]:
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
     apart = jnp.sqrt(dot(pos, pos) + CORE**2)
     closing = jnp.maximum(-dot(pos, vel) / apart, 0)
-    gap = apart - 2 * world.params.collision_radius[None]
+    gap = apart - sums_with(world.params.collision_radius, index)
     speed = jnp.sqrt(dot(vel, vel) + _SLOW**2)
     inside = _MARGIN + _PASSING_TIME * speed + _MARGIN_TIME * closing - gap
     return vector.total((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS))

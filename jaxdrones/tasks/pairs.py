@@ -68,15 +68,27 @@ def closest_approach(pos: Vectors, vel: Vectors, horizon: float) -> tuple[Float[
     return time, along(pos, vel, time)
 
 
+def sums_with(x: Float[Array, " n"], index: Int[Array, "n k"] | None) -> Float[Array, "k n"]:
+    """Sums of a number of each drone and those of the indexed ones; with `None` of all others."""
+    if index is not None:
+        return x[index.T] + x[None]
+    turns = range(1, len(x))
+    return jnp.stack([jnp.roll(x, -k) + x for k in turns]) if turns else jnp.zeros((0, 1), x.dtype)
+
+
 def nearest_on_the_way(
-    before: Float[Array, "n 3"], pos: Float[Array, "n 3"], index: Int[Array, "n k"] | None
+    before: Float[Array, "n 3"],
+    pos: Float[Array, "n 3"],
+    index: Int[Array, "n k"] | None,
+    radius: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
     """Smallest distance of every drone from those of its `index` between two control steps, m; `None` for all.
 
-    Positions are joined by straight ways.
+    Positions are joined by straight ways. With radii it is the gap between two balls, negative where they overlap.
     """
     start, move = seen_from(before, index), seen_from(pos - before, index)
     length = dot(move, move)
     share = jnp.clip(-dot(start, move) / jnp.where(length > 0, length, 1), 0, 1)
     closest = along(start, move, share)
-    return jnp.sqrt(jnp.min(dot(closest, closest), axis=0))
+    distance = jnp.sqrt(dot(closest, closest))
+    return jnp.min(distance if radius is None else distance - sums_with(radius, index), axis=0)

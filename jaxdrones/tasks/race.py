@@ -176,7 +176,7 @@ def _grid(key: jax.Array, params: Params, start: Float[Array, "4"]) -> State:
     order_key, spread_key = jax.random.split(key)
     n, dtype = len(params.mass), start.dtype
     slot = jax.random.permutation(order_key, n) - (n - 1) / 2
-    pos = jnp.broadcast_to(start[:3], (n, 3)).at[:, 1].add(_GRID * slot)
+    pos = jnp.broadcast_to(start[:3], (n, 3)).at[:, 1].add(_GRID * slot).at[:, 2].set(standing_height(params))
     return hovering(params, pos.at[:, :2].add(jax.random.uniform(spread_key, (n, 2), dtype, -_SPREAD, _SPREAD)))
 
 
@@ -250,7 +250,7 @@ def _touching(world: World, before: Float[Array, "n 3"]) -> Bool[Array, " n"]:
         return jnp.zeros(1, bool)
     away = jnp.stack([_FAR * (1 + jnp.arange(n, dtype=dtype))] * 3, axis=-1)  # drones that left the world touch none
     before, pos = (jnp.where(world.active[:, None], x, away) for x in (before, world.drones.pos))
-    return nearest_on_the_way(before, pos, None) < 2 * world.params.collision_radius
+    return nearest_on_the_way(before, pos, None, world.params.collision_radius) < 0
 
 
 def _order(lead: Array, along: Float[Array, " n"], racing: Bool[Array, " n"]) -> tuple[Array, Float[Array, " n"]]:

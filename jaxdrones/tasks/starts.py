@@ -82,7 +82,7 @@ def thrown(
 
 
 def _on_diagonal(params: Params) -> Float[Array, "n 3"]:
-    """Starting positions of gym-pybullet-drones: four arms apart in x and in y, 0.1 m above the ground."""
+    """Starting positions of gym-pybullet-drones, 0.1 m above the ground, four arms of the largest drone apart."""
     i = jnp.arange(len(params.mass))
-    across = _GRID * params.arm * i
+    across = _GRID * jnp.max(params.arm) * i
     return jnp.stack([across, across, standing_height(params) + _CLEARANCE], axis=-1)

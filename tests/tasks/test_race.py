@@ -13,6 +13,7 @@ from jaxdrones.envs import make
 from jaxdrones.tasks import centerline
 from jaxdrones.tasks.race import _order
 from jaxdrones.tasks.racetrack import GATES, OPENING, direction, passes
+from jaxdrones.tasks.starts import standing_height
 
 START = np.array([-1.5, 0.75, 0.0, -0.2])
 LINE = functools.cache(
@@ -77,6 +78,23 @@ def test_drones_that_pass_through_each_other_between_two_control_steps_have_touc
         left, right = [[0.0, 1.5, 1.0], [0.4, 1.5 + aside, 1.0]], [[0.4, 1.5, 1.0], [0.0, 1.5 + aside, 1.0]]
         np.testing.assert_array_equal(after(left, right)["touched"], [touched] * 2)
         np.testing.assert_array_equal(after(left, right, active=[True, False])["touched"], [False] * 2)
+
+
+def test_drones_of_different_vehicles_touch_at_the_sum_of_their_own_radii():
+    world = start()
+    radius = jnp.array([1.0, 3.0]) * world.params.collision_radius
+    world = world.replace(params=world.params.replace(collision_radius=radius))
+    for gap, touched in ((0.99, True), (1.01, False)):
+        pos = jnp.array([[0.0, 1.5, 1.0], [0.0, 1.5, 1.0]]).at[1, 0].add(gap * jnp.sum(radius))
+        now = world.replace(drones=world.drones.replace(pos=pos), variables=world.variables | {"pos": pos})
+        np.testing.assert_array_equal(advance()(now)["touched"], [touched] * 2)
+
+
+@pytest.mark.slow
+def test_each_of_different_vehicles_starts_on_its_own_feet():
+    env = make("race", drones=3, realistic="any")
+    worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 20))[1]
+    np.testing.assert_allclose(worlds.drones.pos[..., 2], jax.vmap(standing_height)(worlds.params), rtol=1e-12)
 
 
 def test_a_flight_along_the_centerline_makes_progress_of_its_length_and_back_none():

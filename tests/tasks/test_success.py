@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized, mostly_slow
 
-from jaxdrones import load_params, repeat
+from jaxdrones import load_params, repeat, stack
 from jaxdrones.envs import TASKS, make
 from jaxdrones.learning import evaluate
 from jaxdrones.pytree import PyTreeNode
@@ -119,3 +119,11 @@ def test_a_spread_beyond_the_height_of_the_start_leaves_drones_above_the_ground(
         params
     )
     assert 0 <= z.min() < 0.01 and 0.49 < z.max() <= 0.5
+
+
+def test_drones_of_different_vehicles_start_apart():
+    one, large = load_params("cf2x"), load_params("hb")
+    params = stack([one, large, one, one, one])
+    pos = above_ground(0.0)(KEY, params)[1]
+    apart = jnp.linalg.norm(pos[:, None] - pos[None], axis=-1) + jnp.eye(5)
+    assert jnp.min(apart) > 2 * jnp.max(params.arm)

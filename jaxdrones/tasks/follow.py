@@ -20,6 +20,7 @@ from jaxdrones.sensing import Camera
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
+from jaxdrones.tasks.pairs import nearest_on_the_way
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm
 from jaxdrones.vector import unit
@@ -27,7 +28,6 @@ from jaxdrones.vector import unit
 HEIGHT = 4.0  # m of the center of the leader's curve
 _MAX_DISTANCE = 10.0  # m
 _MIN_PERIOD = 2.0  # s
-_TOUCHING = 2.0  # collision radii between the centers of two drones
 _MAX_SPEED = 30.0  # m/s, bound of an observation
 _SETTLED = 2.0  # s: time after which the leader has to be in view
 _IN_VIEW = 0.95  # share of the time
@@ -151,7 +151,7 @@ def follow(
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
     pos = world.drones.pos
-    touching = shaping.nearest_drone(pos) < _TOUCHING * world.params.collision_radius
+    touching = nearest_on_the_way(world.variables["pos"], pos, None, world.params.collision_radius) < 0
     fell = pos[:, 2] < world.params.collision_radius
     return world.variables | {
         "pos": pos,

@@ -82,14 +82,30 @@ def _lowest(body: Cylinder) -> Float[Array, ""]:
     return body.pos[2] - body.extent(rotation.rotate_inverse(body.quat, up))
 
 
-def _touch_each_other(bodies: Cylinder, margin: ArrayLike) -> Bool[Array, " n"]:
+def met_on_the_way(params: Params, state: State, before: Float[Array, "n 3"], margin: ArrayLike) -> Bool[Array, " n"]:
+    """Which drones of a team touched another one where their centers were closest on straight ways from `before`, m.
+
+    All keep the attitude of the `state` at the end. Bodies that only graze each other may have touched elsewhere.
+    """
+    return _touch_each_other(_bodies(params, state), margin, state.pos - before)
+
+
+def _touch_each_other(
+    bodies: Cylinder, margin: ArrayLike, ways: Float[Array, "n 3"] | None = None
+) -> Bool[Array, " n"]:
+    """Whether each drone touches another one; with `ways` (m) at the closest approach of their centers on these."""
     index = jnp.arange(len(bodies.pos))
+    ways = jnp.zeros_like(bodies.pos) if ways is None else ways
 
-    def with_other(i, body, j, other):
-        return (i != j) & (_gap(body, other) <= margin)
+    def with_other(i, body, way, j, other, other_way):
+        moved = way - other_way
+        square = dot(moved, moved)
+        back = jnp.clip(dot(body.pos - other.pos, moved) / jnp.where(square > 0, square, 1), 0, 1)
+        return (i != j) & (_gap(body.replace(pos=body.pos - back * moved), other) <= margin)
 
-    with_others = jax.vmap(with_other, (None, None, 0, 0))
-    return jnp.any(jax.vmap(with_others, (0, 0, None, None))(index, bodies, index, bodies), axis=1)
+    with_others = jax.vmap(with_other, (None, None, None, 0, 0, 0))
+    touch = jax.vmap(with_others, (0, 0, 0, None, None, None))(index, bodies, ways, index, bodies, ways)
+    return jnp.any(touch, axis=1)
 
 
 def _touch_any(bodies: Cylinder, obstacles: Obstacle, margin: ArrayLike) -> Bool[Array, " n"]:

@@ -8,6 +8,7 @@ from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.dynamics.contact import rim
 from jaxdrones.params import Params
 from jaxdrones.sensing import Collisions, Scene, collisions
+from jaxdrones.sensing.collisions import met_on_the_way
 from jaxdrones.sensing.distances import merged
 from jaxdrones.sensing.sweep import Disc, meets
 from jaxdrones.state import State
@@ -49,6 +50,8 @@ METRICS = {
 
 def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[Array, Array, Array]:
     found = collisions(params, drones, scene, _MARGIN)
+    if len(before) > 1:
+        found = found.replace(drones=found.drones | met_on_the_way(params, drones, before, _MARGIN))
     if not scene.has_obstacles:
         return found.ground, found.drones, found.scene
     kinds = merged(scene.shapes(before.dtype))
@@ -67,7 +70,8 @@ def _near(params: Params, drones: State, before: Array, scene: Scene) -> Bool[Ar
     """Whether an obstacle, the ground or another drone is within the ball about each drone."""
     half = params.collision_height / 2
     ball = jnp.abs(params.collision_offset) + safe_sqrt(params.collision_radius**2 + half**2) + _MARGIN
-    near = jax.vmap(scene.distance)(drones.pos) <= ball + norm(drones.pos - before)
-    for k in range(1, len(ball)):
-        near |= norm(jnp.roll(drones.pos, k, axis=0) - drones.pos) <= jnp.roll(ball, k) + ball
+    reach = ball + norm(drones.pos - before)
+    near = jax.vmap(scene.distance)(drones.pos) <= reach
+    for k in range(1, len(reach)):
+        near |= norm(jnp.roll(drones.pos, k, axis=0) - drones.pos) <= jnp.roll(reach, k) + reach
     return near

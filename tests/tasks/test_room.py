@@ -51,6 +51,20 @@ def test_touching_is_of_walls_pillars_the_ground_and_each_other():
     np.testing.assert_array_equal(moved_to(a, pillar, c)["touched"], [False, True, False])
 
 
+@pytest.mark.slow
+def test_drones_that_pass_through_each_other_between_two_control_steps_have_touched():
+    """Five meters a second each: 20 cm between two control steps, more than the two drones are wide."""
+    env = make("room", drones=3, pillars=0)
+    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
+    met = jit_unoptimized(lambda world: env.task.advance(env.task, world)["touched"])
+    for gap, touched in ((1.9, True), (2.1, False)):
+        aside = gap * float(env.params.collision_radius[0])
+        before = world.drones.pos.at[:2].set(jnp.array([[-0.1, 0.0, 1.0], [0.1, aside, 1.0]]))
+        after = world.drones.replace(pos=before.at[:2, 0].multiply(-1))
+        now = world.replace(drones=after, variables=world.variables | {"pos": before})
+        np.testing.assert_array_equal(met(now), [touched, touched, False])
+
+
 def test_success_is_arriving_within_20_cm_without_touching():
     errors = jnp.array([[1.0, 1.0, 1.0], [0.1, 0.3, 0.1]])  # time, drones
     touched = jnp.array([[0.0, 0, 0], [0, 0, 1]])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones.params import Params
-from jaxdrones.vector import dot, largest, safe_sqrt
+from jaxdrones.vector import components, dot, largest, safe_sqrt
 
 _MIN_SHARE = 0.01  # smallest significant share of a rotor in thrust or yaw; usually each rotor has 0.25
 _OTHERS = tuple(tuple(j for j in range(4) if j != i) for i in range(4))  # the other rotors of each one
@@ -32,8 +32,10 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     """
     x, y, _ = params.rotor_pos.T
     arm = params.arm
-    torque_scale = jnp.stack([params.kf * arm, params.kf * arm, params.km])
-    target = jnp.append(thrust / params.kf, torque / torque_scale)
+    roll, pitch, yaw = components(torque)
+    yaws = params.km > 0  # otherwise no rotor speeds produce a yaw torque, and its demand is ignored
+    yaw = jnp.where(yaws, yaw / jnp.where(yaws, params.km, 1), 0)
+    target = jnp.stack([thrust / params.kf, roll / (params.kf * arm), pitch / (params.kf * arm), yaw])
     inverses = _inverses(jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin], axis=-1))
     inverse, limit = jnp.stack([rows[-1] for rows in inverses]), _square_of_limit(params)
     target = _within_authority(inverse, target, limit)

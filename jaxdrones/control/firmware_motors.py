@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import vector
 from jaxdrones.arguments import checked, choice
+from jaxdrones.checks import check_number
 from jaxdrones.control.allocation import mixer
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -117,9 +118,15 @@ def rotor_speeds(
 def scale(params: Params) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """Factors of the firmware's thrust and torque commands for a vehicle to respond like a Crazyflie.
 
-    The first is the weight over that of a Crazyflie.
+    The first is the weight over that of a Crazyflie. A torque that no rotor speeds produce is not commanded.
+
+    Raises:
+        ValueError: there is no gravity.
     """
-    return params.weight / _WEIGHT, jnp.array(_ACCELERATION) / _acceleration(params)
+    check_number("params.gravity", params.gravity, "m/s^2", above=0)
+    acceleration = _acceleration(params)
+    turns = acceleration != 0
+    return params.weight / _WEIGHT, jnp.where(turns, jnp.array(_ACCELERATION) / jnp.where(turns, acceleration, 1), 0)
 
 
 def _acceleration(params: Params) -> Float[Array, "3"]:

@@ -245,6 +245,18 @@ def test_gradients_of_the_allocation_are_finite_without_a_limit_and_with_equal_d
 
 
 @pytest.mark.slow
+def test_a_vehicle_whose_rotors_have_no_drag_ignores_the_demand_of_yaw():
+    """Its parameters are allowed; thrust, roll and pitch are those without the demand, and so are gradients."""
+    params = jaxdrones.load_params("cf2x").replace(km=jnp.zeros(()))
+    torque = jnp.array([1e-4, -2e-4, 1e-3])
+    rpm = allocate(params, params.weight, torque)
+    np.testing.assert_array_equal(rpm, allocate(params, params.weight, torque.at[2].set(0)))
+    wrench = wrenches_of(params, rpm[None])
+    np.testing.assert_allclose(wrench.force[0, 2], params.weight, rtol=1e-9)
+    np.testing.assert_allclose(wrench.torque[0, :2], torque[:2], rtol=1e-9)
+    assert_finite(differentiate(params, params.weight, torque))
+
+
 def test_compiled_and_batched_allocations_equal_single_ones():
     params = jaxdrones.load_params("racer")
     thrust, torque = wild_wrenches(params, seed=4)

@@ -12,7 +12,7 @@ from helpers import VEHICLES, assert_finite, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
-from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team
+from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team, mellinger
 from jaxdrones.control.allocation import mixer
 from jaxdrones.thrust_curves import thrust_at, voltage_for
 
@@ -258,3 +258,13 @@ def test_gradients_of_limited_commands_are_finite_however_a_compiler_rounds():
 
     for compiled in jax.jit, jit_unoptimized:
         assert_finite(compiled(jax.vmap(jax.grad(total, (0, 1))))(thrust, torque))
+
+
+@pytest.mark.parametrize("controller", [firmware_pid, mellinger])
+def test_gains_of_a_vehicle_that_cannot_yaw_leave_yaw_out_and_without_gravity_there_are_none(controller):
+    params = jaxdrones.load_params("cf2x")
+    gains, without = controller.gains(params), controller.gains(params.replace(km=jnp.zeros(())))
+    assert_finite(without)
+    np.testing.assert_array_equal(without.rate_p, gains.rate_p * jnp.array([1, 1, 0]))
+    with pytest.raises(ValueError, match=r"params.gravity is .*0.*; give a positive number \(m/s\^2\)"):
+        controller.gains(params.replace(gravity=jnp.zeros(())))

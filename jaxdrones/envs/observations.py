@@ -192,6 +192,7 @@ def _deviation(value: Array, nominal: Array) -> Array:
 
 
 def _clip(x: Array, bound: float | tuple[float, ...]) -> Array:
+    x = x.astype(jnp.result_type(x, 1.0))  # a whole number may have no room for the bound, or for its negative
     limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
     return jnp.clip(x, -limit, limit)
 

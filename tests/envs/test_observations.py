@@ -1,15 +1,18 @@
 """Observation terms against what they stand for."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 from scipy.spatial.transform import Rotation
 
 import jaxdrones as jd
-from jaxdrones.envs import OBSERVATIONS, TASKS
+from jaxdrones.envs import OBSERVATIONS, TASKS, make
 from jaxdrones.envs.observations import deviations
-from jaxdrones.tasks import World
+from jaxdrones.tasks import ObservationTerm, World
 
 TASK = TASKS["hover"](drones=2)
 TEAM = jd.repeat(jd.load_params("cf2x"), 2)
@@ -32,3 +35,17 @@ def test_a_privileged_critic_is_given_relative_deviations_of_what_is_drawn():
     drawn = TEAM.replace(mass=TEAM.mass * jnp.array([1.1, 0.8]), kf=2 * TEAM.kf)
     chosen = [x is TEAM.mass for x in jax.tree.leaves(TEAM)]
     np.testing.assert_allclose(deviations(drawn, TEAM, chosen), [[0.1], [-0.2]], rtol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [jnp.uint8, jnp.int8, jnp.int32])
+@pytest.mark.parametrize("bound", [10.0, 1000.0, np.inf])
+def test_a_term_of_whole_numbers_is_clipped_as_the_same_real_numbers_are(dtype, bound):
+    task = TASKS["hover"]()
+    values = jnp.arange(0, 120, 40).astype(dtype)[None]
+    whole, real = (ObservationTerm(lambda task, world, v=v: v, bound) for v in (values, values.astype(float)))
+    obs = []
+    for term in whole, real:
+        env = make(dataclasses.replace(task, observations={"own": term}), observation=("own",))
+        obs.append(jit_unoptimized(env.reset)(jax.random.key(0))[0])
+    assert obs[0].dtype == obs[1].dtype
+    np.testing.assert_array_equal(*obs)

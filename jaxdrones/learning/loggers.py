@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -120,7 +121,8 @@ def named_loggers(names: str | None, folder: Path) -> list[Any]:
 
 
 def _score(report: Report) -> tuple[float, float]:
-    return report.success or 0.0, report.mean_return
+    """Success and return; a return that is not finite is the worst."""
+    return report.success or 0.0, report.mean_return if math.isfinite(report.mean_return) else -math.inf
 
 
 def _library(name: str) -> Any:

@@ -192,3 +192,16 @@ def test_the_best_policy_is_kept(monkeypatch):
     for update in reports:
         best(update, {}, types.SimpleNamespace(policy=update))
     assert best.policy == 3 and best.report.success == 0.9
+
+
+def test_a_policy_whose_return_is_no_number_is_replaced_by_any_other(monkeypatch):
+    returns = {1: float("nan"), 2: -5.0, 3: float("nan"), 4: float("inf")}
+
+    def compiled(env, policy, episodes):
+        return lambda policy, key: types.SimpleNamespace(success=None, mean_return=returns[policy])
+
+    monkeypatch.setattr(loggers, "compile_evaluation", compiled)
+    best = loggers.KeepBest(None, KEY, every=1)
+    for update in returns:
+        best(update, {}, types.SimpleNamespace(policy=update))
+    assert best.policy == 2

@@ -156,12 +156,14 @@ def _any_of(conditions: dict[str, Array], start: Array) -> Array:
 def _ends_of_team(env: Any, world: World, terminated: Array, truncated: Array) -> tuple[Array, Array]:
     """Whether the episode of the team terminated and whether it was truncated.
 
-    With `ends="drone"` it ends with the last drone: truncated at the time limit, else terminated.
+    With `ends="drone"` it ends with the last drone: truncated at the time limit or as a drone of the last ones is, else
+    terminated.
     """
     if env.task.ends == "team":
         return terminated[0], truncated[0]
-    over = world.step >= env.steps
-    return ~jnp.any(world.active) & ~over, over
+    over, ended = world.step >= env.steps, ~jnp.any(world.active)
+    cut = jnp.any(truncated & ~terminated)
+    return ended & ~cut & ~over, over | ended & cut
 
 
 def _noisy_observation(env: Any, key: Key, world: World) -> Array:

@@ -93,6 +93,16 @@ def test_the_others_fly_on_and_the_team_ends_with_the_last():
     assert ends.index(True) == max(int(np.argmax([x[4]["terminated"][i] for x in both])) for i in range(2))
 
 
+@pytest.mark.slow
+def test_a_team_whose_last_drone_is_cut_is_cut_and_not_terminated():
+    """A learner goes on from the value there; so it does where the others had ended before."""
+    for actions, cut in ([1.0, 1.0], True), ([-1.0, 1.0], True), ([-1.0, -1.0], False):
+        answers = flown(column(), actions)
+        last = next(k for k, answer in enumerate(answers) if answer[2] or answer[3])
+        assert last < STEPS - 1 and not np.any(answers[last][0].active)
+        assert [bool(x) for x in answers[last][2:4]] == [not cut, cut]
+
+
 def test_by_default_the_end_of_a_drone_is_that_of_its_team():
     *_, terminated, _, info = zip(*flown(column(ends="team"), [-1.0, 0.0]), strict=True)
     first = int(np.argmax(terminated))

@@ -39,7 +39,8 @@ _NEXT = np.uint32(2**32 - 1)  # fold for the key of the next episode, above the 
 class BraxEnv(base.Env):
     """One world with one agent: actions and observations of the drones are concatenated.
 
-    `metrics` has the weighted terms of the reward, and means over the drones of the task's metrics.
+    `metrics` has the weighted terms of the reward, and means of the task's metrics over the drones that
+    have not ended their episodes.
 
     As in all of brax's environments, the time limit is the trainer's `episode_length`; give `env.steps`.
     `info["time_out"]` is 1 where the task truncated the episode. With images, observations are dictionaries for brax's
@@ -84,7 +85,12 @@ class BraxEnv(base.Env):
         world, key = state.pipeline_state
         action = jnp.reshape(action, (self.env.drones, self.env.action_size))
         obs, world, reward, terminated, _, info = self.env.step(jax.random.fold_in(key, world.step), world, action)
-        cut = jnp.any(functools.reduce(jnp.logical_or, info["truncations"].values(), jnp.zeros((), bool)))
+        cut = functools.reduce(jnp.logical_or, info["truncations"].values(), jnp.zeros((), bool))
+        if self.env.task.ends == "drone":  # the last drones decide, whatever the time limit of the task is
+            ended = ~jnp.any(world.active)
+            cut = ended & cut & ~info["terminated"]
+            terminated = ended & ~jnp.any(cut)
+        cut = jnp.any(cut)
         return state.replace(
             pipeline_state=(world, key),
             obs=self._flat(obs),
@@ -102,7 +108,9 @@ class BraxEnv(base.Env):
 
     def _metrics(self, info: dict[str, Any]) -> dict[str, jax.Array]:
         rewards = {f"reward_{name}": _float(self._rewarding(x)) for name, x in info["rewards"].items()}
-        return rewards | {name: _float(jnp.mean(x)) for name, x in info["metrics"].items()}
+        count = jnp.maximum(jnp.sum(info["active"]), 1)
+        means = {name: jnp.sum(jnp.where(info["active"], x, 0)) / count for name, x in info["metrics"].items()}
+        return rewards | {name: _float(mean) for name, mean in means.items()}
 
 
 wrap = BraxEnv

@@ -90,6 +90,21 @@ def test_a_cut_is_told_from_an_end():
     assert steps[first[0] + 1, 0] == 1  # of the next episode
 
 
+def test_a_team_whose_drones_end_alone_goes_on_until_its_last_is_cut():
+    """Also beyond its own time limit; a drone that left, and was moved far away, is not counted in its metrics."""
+    late = {"late": lambda task, world: world.step >= jnp.array([2, 6])}
+    plain = make(dataclasses.replace(hover(drones=2, duration=0.04), ends="drone", terminations={}, truncations=late))
+    env = brax.wrap(plain)
+    state = jit_unoptimized(env.reset)(jax.random.PRNGKey(0))
+    step, after = jit_unoptimized(env.step), []
+    for _ in range(6):
+        state = step(state, jnp.zeros(8))
+        after.append(state)
+    done = [float(x.done) for x in after]
+    assert done.index(1) > plain.steps and done == [float(x.info["time_out"]) for x in after]
+    assert not np.any(after[-1].pipeline_state[0].active) and max(x.metrics["error"] for x in after) < 10
+
+
 @pytest.mark.slow
 def test_every_episode_starts_anew(env_of):
     env = brax.wrap(env_of("hover"))

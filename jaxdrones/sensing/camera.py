@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, number, quaternion
+from jaxdrones.arguments import checked, choice, number, quaternion
 from jaxdrones.checks import check_number, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import along_z, cross, unit
+from jaxdrones.vector import along_z, cross, safe_sqrt, unit
 
 _POSITIVE = number(name="{argument} of a camera", above=0)
 
@@ -104,6 +104,11 @@ class Camera:
         return params.arm if self.near is None else jnp.asarray(self.near, params.arm.dtype)
 
 
+_AMOUNT = number(name="{argument} of {function}", at_least=0)
+_SHARE = number("a share", "{argument} of {function}", at_least=0, at_most=1)
+
+
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DepthNoise:
     """Depth noise of a stereo camera: depth = focal length times baseline / disparity.
@@ -113,17 +118,17 @@ class DepthNoise:
     `far`.
     """
 
-    spread: float = 0.0
+    spread: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of the depth at 1 m, m; at z m it is z^2 times as large. About 0.002 for stereo cameras of
     5 cm baseline and 640 pixels a row (a tenth of a pixel)."""
-    constant_spread: float = 0.0
+    constant_spread: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation independent of the depth, m, added in quadrature."""
-    disparity_step: float = 0.0
+    disparity_step: Annotated[float, _AMOUNT] = 0.0
     """Resolution of 1 / depth, 1/m; zero for none. For a stereo camera it is the resolution of the disparity (pixels)
     over focal length (pixels) times baseline (m)."""
-    dropout: float = 0.0
+    dropout: Annotated[float, _SHARE] = 0.0
     """Fraction of the pixels without a value."""
-    missing: str = "zero"
+    missing: Annotated[str, choice("value of a missing pixel", ("zero", "far"))] = "zero"
     """Value of a missing pixel: `zero`, as in most drivers, or `far`."""
 
     def apply(self, key: jax.Array, depth: Float[Array, "*images h w"], camera: Camera) -> Float[Array, "*images h w"]:
@@ -137,7 +142,7 @@ class DepthNoise:
         seen = depth < far
         noisy = depth
         if self.spread or self.constant_spread:
-            deviation = jnp.sqrt((self.spread * depth**2) ** 2 + self.constant_spread**2)
+            deviation = safe_sqrt((self.spread * depth**2) ** 2 + self.constant_spread**2)
             noisy += deviation * jax.random.normal(scatter_key, depth.shape, depth.dtype)
         noisy = jnp.clip(noisy, 0 if camera.near is None else camera.near, far)
         if self.disparity_step:

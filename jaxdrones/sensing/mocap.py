@@ -2,32 +2,38 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked, number
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 
+_NAME = "{argument} of {function}"
+_AMOUNT = number(name=_NAME, at_least=0)
 
+
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MotionCaptureSystem:
     """Rate, delay, dropouts and noise of a motion capture system."""
 
-    rate: float = 100.0
+    rate: Annotated[float, number("1/s", _NAME, above=0)] = 100.0
     """Poses per second."""
-    delay: float = 0.0
+    delay: Annotated[float, _AMOUNT] = 0.0
     """Age of a pose when it arrives, s."""
-    dropout: float = 0.0
+    dropout: Annotated[float, number("a share", _NAME, at_least=0, at_most=1)] = 0.0
     """Fraction of lost poses."""
-    pos_noise: float = 0.0
+    pos_noise: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of each coordinate, m."""
-    angle_noise: float = 0.0
+    angle_noise: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of the attitude about each axis, rad."""
 
     def noisy(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +11,14 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxdrones.arguments import checked, number
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
 _FLICKER_FLOOR = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise over its bias instability
 _PEAK = 0.61736  # the largest Allan deviation of a Gauss-Markov process over its standard deviation, at 1.89 times T
+_NAME = "{argument} of {function}"
+_AMOUNT, _POSITIVE = number(name=_NAME, at_least=0), number(name=_NAME, above=0, infinite=True)
 
 
 class Errors(PyTreeNode):
@@ -35,6 +39,7 @@ class Errors(PyTreeNode):
         return self.turn_on + self.drift + self.walk
 
 
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Noise:
     """Error model of the channels of a sensor with readings in a unit u; channels are independent.
@@ -44,19 +49,19 @@ class Noise:
     the number is used as `density`, which overestimates the noise of a part.
     """
 
-    density: float = 0.0
+    density: Annotated[float, _AMOUNT] = 0.0
     """White noise, u/sqrt(Hz): its Allan deviation over t seconds is density / sqrt(t)."""
-    instability: float = 0.0
+    instability: Annotated[float, _AMOUNT] = 0.0
     """Bias instability B, u: the Allan deviation of the bias is at most 0.664 B, at a time of 1.89 `correlation`."""
-    correlation: float = 100.0
+    correlation: Annotated[float, _POSITIVE] = 100.0
     """Correlation time of the Gauss-Markov process of the bias instability, s."""
-    random_walk: float = 0.0
+    random_walk: Annotated[float, _AMOUNT] = 0.0
     """Random walk K of the bias, u/s/sqrt(Hz): its Allan deviation over t seconds is K sqrt(t / 3)."""
-    turn_on: float = 0.0
+    turn_on: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of the bias at the start of an episode, u."""
-    scale: float = 0.0
+    scale: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of the scale factor error at the start of an episode."""
-    limit: float = math.inf
+    limit: Annotated[float, _POSITIVE] = math.inf
     """Largest reading, at which a channel saturates, u."""
 
     @property

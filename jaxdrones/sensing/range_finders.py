@@ -187,7 +187,12 @@ def time_of_flight(
     return range_finder("time_of_flight", rays, max_range=max_range, rate=rate, **others)
 
 
-def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
+@checked
+def optical_flow(
+    rate: float | None = 100.0,
+    noise: Annotated[float, number("rad/s", "{argument} of {function}", at_least=0)] = 0.0,
+    dropout: Annotated[float, number("a share", "{argument} of {function}", at_least=0, at_most=1)] = 0.0,
+) -> Sensor:
     """Optical flow sensor, the PMW3901; its reading (2,) is the flow backward and to the right, rad/s.
 
     With the velocity v and the body rates w, in body axes, and the range d along the body's -z axis, the flow is (v_x /

@@ -63,3 +63,9 @@ def test_the_gradient_is_that_of_the_scatter_and_zero_where_a_pixel_is_missing()
     np.testing.assert_allclose(total(scatter), difference / 2e-5, rtol=1e-6)
     lost = whole.apply(KEY, flat(2.0), CAMERA) == 0
     np.testing.assert_allclose(total(whole), jnp.where(lost, 0, total(scatter)), rtol=1e-12)
+
+
+def test_the_gradient_is_finite_also_where_something_touches_the_camera():
+    noise = DepthNoise(spread=0.01)
+    gradient = jax.grad(lambda depth: jnp.sum(noise.apply(KEY, depth, CAMERA)))(flat(0.0))
+    assert np.all(np.isfinite(gradient))

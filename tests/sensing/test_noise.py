@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.sensing import BMI088, MPU9250, Noise, allan_deviation
+from jaxdrones.sensing import (
+    BMI088,
+    MPU9250,
+    DepthNoise,
+    MotionCaptureSystem,
+    Noise,
+    allan_deviation,
+    optical_flow,
+)
 
 KEY = jax.random.key(0)
 WHITE, WALK, DRIFT = Noise(density=0.02), Noise(random_walk=0.3), Noise(instability=0.5, correlation=0.05)
@@ -88,3 +96,26 @@ def test_white_noise_shrinks_and_the_walk_of_the_bias_grows_with_the_root_of_the
 def test_too_few_readings_are_refused():
     with pytest.raises(ValueError, match=r"\(20,\) readings are too few to average 10; give at least"):
         allan_deviation(np.zeros(20), 0.01, 10)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Noise(density=-0.1), "density of Noise is -0.1; give a number of at least 0"),
+        (lambda: Noise(correlation=0), "correlation of Noise is 0; give a positive number"),
+        (lambda: Noise(limit=np.nan), "limit of Noise is nan; give a positive number"),
+        (lambda: Noise(scale="a"), "scale of Noise is 'a'"),
+        (lambda: MotionCaptureSystem(dropout=2), r"dropout of MotionCaptureSystem is 2; give .* at most 1 \(a share\)"),
+        (lambda: MotionCaptureSystem(rate=0), "rate of MotionCaptureSystem is 0; give a positive number"),
+        (lambda: MotionCaptureSystem(delay=-0.1), "delay of MotionCaptureSystem is -0.1"),
+        (lambda: MotionCaptureSystem(pos_noise=np.inf), "pos_noise of MotionCaptureSystem is inf"),
+        (lambda: DepthNoise(dropout=1.5), r"dropout of DepthNoise is 1.5; give .* at most 1 \(a share\)"),
+        (lambda: DepthNoise(missing="nan"), r"unknown value of a missing pixel 'nan'.*far, zero"),
+        (lambda: DepthNoise(disparity_step=-1), "disparity_step of DepthNoise is -1"),
+        (lambda: optical_flow(noise=-1), "noise of optical-flow is -1"),
+        (lambda: optical_flow(dropout=np.nan), r"dropout of optical-flow is nan"),
+    ],
+)
+def test_errors_that_make_no_sense_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

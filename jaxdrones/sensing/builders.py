@@ -3,7 +3,7 @@
 Random scenes have the same array shapes for every key, so one compiled program serves any number of worlds.
 """
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.arguments import Key, checked, shape
-from jaxdrones.checks import check_number
+from jaxdrones.arguments import Key, NonNegativeInt, checked, number, shape
+from jaxdrones.checks import check_number, check_shape, is_concrete
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
@@ -28,22 +28,46 @@ BEAMS = 4
 """Boxes of a gate."""
 _MAX_TREES = 10_000
 _HEIGHT_OF_FLIGHT = 1.5  # m; default height of the points to keep free
+_MOST_TILTED = 90.0  # degrees, excluded
+
+
+def _check_range(name: str, value: Any) -> None:
+    """Raise unless this is a range of numbers that are not negative, or traced."""
+    check_shape(name, value, (2,), "the smallest and the largest")
+    low, high = value
+    check_number(f"smallest {name}", low, at_least=0)
+    check_number(f"largest {name}", high, at_least=float(low) if is_concrete(low) else None)
+
+
+def _check_density(name: str, density: Any) -> None:
+    _check_range(f"{name} of a forest", density if np.ndim(density) else (density, density))
+
+
+def _check_size(name: str, size: Any) -> None:
+    check_shape(f"{name} of a room", size, (3,), "length, width and height, m")
+    for edge in size:
+        check_number(f"{name} of a room", edge, "m", above=0)
+
+
+_LENGTH = Annotated[float, number("m", "{argument} of a {function}", above=0)]
+_DISTANCE = Annotated[float, number("m", "{argument} of a {function}", at_least=0)]
+_RADII = Annotated[tuple[float, float], _check_range]
 
 
 @checked
 def forest(
     key: Key,
     *,
-    density: float | tuple[float, float] = 0.15,
-    length: float = 20.0,
-    width: float = 10.0,
-    radius: tuple[float, float] = (0.1, 0.3),
-    height: float = 5.0,
-    tilt: float = 0.0,
-    spheres: int = 0,
-    boxes: int = 0,
+    density: Annotated[float | tuple[float, float], _check_density] = 0.15,
+    length: _LENGTH = 20.0,
+    width: _LENGTH = 10.0,
+    radius: _RADII = (0.1, 0.3),
+    height: _LENGTH = 5.0,
+    tilt: Annotated[float, number("degrees", "{argument} of a forest", at_least=0, below=_MOST_TILTED)] = 0.0,
+    spheres: NonNegativeInt = 0,
+    boxes: NonNegativeInt = 0,
     keep_free: ArrayLike | None = None,
-    clearance: float = 1.5,
+    clearance: _DISTANCE = 1.5,
 ) -> Scene:
     """Random forest on a strip from x = 0 to `length` and from y = -`width`/2 to `width`/2.
 
@@ -65,7 +89,7 @@ def forest(
         clearance: smallest distance of an obstacle from those points, m.
 
     Raises:
-        ValueError: no random key, or more than 10,000 trees.
+        ValueError: no random key, a number out of range, or more than 10,000 trees.
     """
     low, high = np.broadcast_to(np.asarray(density), (2,)).tolist()
     trees = round(high * length * width)
@@ -86,16 +110,16 @@ def forest(
 
 @checked
 def room(
-    size: tuple[float, float, float] = (8.0, 8.0, 3.0),
+    size: Annotated[tuple[float, float, float], _check_size] = (8.0, 8.0, 3.0),
     *,
     key: Key | None = None,
-    pillars: int = 0,
-    spheres: int = 0,
-    boxes: int = 0,
-    radius: tuple[float, float] = (0.15, 0.3),
+    pillars: NonNegativeInt = 0,
+    spheres: NonNegativeInt = 0,
+    boxes: NonNegativeInt = 0,
+    radius: _RADII = (0.15, 0.3),
     keep_free: ArrayLike = (),
-    clearance: float = 0.5,
-    wall: float = 0.2,
+    clearance: _DISTANCE = 0.5,
+    wall: _LENGTH = 0.2,
 ) -> Scene:
     """Room centered at the origin: four walls, a ceiling, random pillars and clutter.
 

@@ -75,3 +75,11 @@ def test_a_ring_has_room_for_so_many_drones():
     make("room", drones=12)
     with pytest.raises(ValueError, match="at most 12"):
         make("room", drones=13)
+
+
+@pytest.mark.float32
+def test_terms_and_metrics_of_a_drone_that_flies_alone_are_one_number_for_it():
+    env = make("room", drones=1)
+    info = jax.eval_shape(lambda key: env.step(key, env.reset(key)[1], jnp.zeros((1, 4))), jax.random.key(0))[5]
+    for kind in "rewards", "metrics", "terminations":
+        assert {name: x.shape for name, x in info[kind].items()} == dict.fromkeys(info[kind], (1,))

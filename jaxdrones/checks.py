@@ -21,9 +21,9 @@ _SMALLEST = np.finfo(np.float64).tiny
 _LONGEST = 120  # characters of a value in an error
 UNIT_LENGTH = 1e-3  # tolerance of the length of a unit quaternion, far above float32 and integrator errors
 _NUMBERS = "biuf"  # kinds of dtypes
-POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm")
+POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm", "prop_radius")
 """Constants of a vehicle that must be positive."""
-NOT_NEGATIVE = ("km", "gravity", "air_density")
+NOT_NEGATIVE = ("km", "gravity", "air_density", "collision_radius", "collision_height")
 """Constants that must not be negative."""
 _MAY_BE_INFINITE = ("max_rpm",)
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)

@@ -181,7 +181,11 @@ def test_quaternions_that_are_off_by_rounding_are_taken_with_either_sign():
         assert np.isfinite(step(team, start.replace(quat=factor * start.quat), rpm).pos).all()
 
 
-CONSTANTS = [(name, value) for name in POSITIVE for value in (0, -1)] + [("km", -1), ("gravity", -9.8)]
+CONSTANTS = [(name, value) for name in POSITIVE for value in (0, -1)] + [
+    ("km", -1),
+    ("gravity", -9.8),
+    ("collision_radius", -0.1),
+]
 
 
 @pytest.mark.parametrize(("name", "value"), CONSTANTS)

@@ -45,9 +45,9 @@ def check_env(env: Env, steps: int = 5) -> None:
 
 
 def _random_actions(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
-    key = jax.random.key(1)
+    key, action_key = jax.random.split(jax.random.key(1))
     shape = (steps, env.drones, env.action_size)
-    return jax.random.split(key, steps), jax.random.uniform(key, shape, float, -0.3, 0.3)
+    return jax.random.split(key, steps), jax.random.uniform(action_key, shape, float, -0.3, 0.3)
 
 
 def _check_obs(env: Env, obs: Any, where: str) -> None:

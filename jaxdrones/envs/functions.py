@@ -76,9 +76,9 @@ def check_episode(
     one = jax.tree.map(lambda x: x[0], params)
 
     def sizes(key: jax.Array) -> list[Any]:
-        for function in draws:
-            _check_randomization(function, key, one)
-        _check_start(task, params, scene, key)
+        for k, function in enumerate(draws, 1):
+            _check_randomization(function, jax.random.fold_in(key, k), one)
+        _check_start(task, params, scene, jax.random.fold_in(key, 0))
         world = first_world(key)
         _check_functions(task, world, dt)
         _check_terms(task, terms, world)
@@ -95,7 +95,7 @@ def check_episode(
 
 
 def _scene_of(scene: Scene | DrawScene, key: jax.Array) -> Scene:
-    return scene if isinstance(scene, Scene) else scene(key)
+    return scene if isinstance(scene, Scene) else scene(jax.random.fold_in(key, 1))
 
 
 def _check_values(what: str, function: Callable, draw: Callable, check: Callable) -> None:

@@ -268,3 +268,10 @@ def test_actions_beyond_one_are_cut():
     env = make_env("hover")
     _, world = env.reset(KEY)
     assert_close(env.step(KEY, world, zeros(env) + 5)[1].drones, env.step(KEY, world, zeros(env) + 1)[1].drones, 0)
+
+
+def test_no_random_key_is_used_twice_where_an_environment_is_made_reset_and_flown():
+    with jax.debug_key_reuse(True):
+        env = make("hover", realistic=True)
+        world = jax.eval_shape(env.reset, KEY)[1]
+        jax.eval_shape(env.step, KEY, world, jnp.zeros((1, 4)))

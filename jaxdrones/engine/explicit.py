@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.arguments import Count, Seconds, checked
 from jaxdrones.checks import check_params, check_quaternion
+from jaxdrones.dynamics import INTEGRATORS
 from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
@@ -121,7 +122,8 @@ def make_step(
         rpm (n, 4) the commanded rotor speeds. Rotor speeds are limited to [0, `params.max_rpm`]. There is no floor:
         drones fall through z = 0 without `ground_contact` in `effects`, and pass through each other without
         `drone_contact` in `pairs`. The step raises `ValueError` on a wrong shape, and with concrete arguments on
-        constants that cannot fly and on quaternions that are not of unit length.
+        constants that cannot fly, on rotors that lag by less than half of `dt`, and on quaternions that are not of unit
+        length.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
@@ -151,6 +153,7 @@ class ExplicitStep(Step):
     def __init__(self, physics: Physics, integrator: Integrator, dt: float, substeps: int, scene: Scene):
         self.physics, self._scene, self.dt, self.substeps = physics, scene, dt, substeps
         self.integrator = describe([integrator])
+        self._divides = integrator not in INTEGRATORS.values()  # a user's own may divide the physics step
         self.period = dt * substeps  # s, of a call
         self._check_scene(scene)
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
@@ -191,11 +194,17 @@ class ExplicitStep(Step):
         """Advance a team by one control step; see `make_step`."""
         if params is not self._params or state.quat is not self._quat:
             check_params(params, finite=False)
+            self.check_lag(params)
             check_quaternion("state.quat", state.quat)
         state = self._step(params, state, rpm, self._given(scene))
         if not is_traced(state.quat):
             self._params, self._quat = params, state.quat
         return state
+
+    def check_lag(self, params: Params) -> None:
+        """Raise for rotors whose lag is too short for the physics step."""
+        if not self._divides:
+            self.physics.check_lag(params, self.dt)
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Time derivative of the state, with rotors without a lag at their commanded speed; see `make_derivative`."""

@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, sequence
-from jaxdrones.checks import bind, check_function, takes
+from jaxdrones.checks import bind, check_function, is_concrete, takes
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import layers, needs_of
-from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
+from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.errors import UserError
@@ -114,6 +115,16 @@ class Physics:
         text += f", team effects: {describe(self.team_effects)}" if self.team_effects else ""
         text += f", models: {', '.join(model.name for model in self.models)}" if self.models else ""
         return text + (f", {self.neighbors}" if self.neighbors else "")
+
+    def check_lag(self, params: Params, dt: float) -> None:
+        """Raise for rotors that lag by less than half a physics step (s): their speed would swing ever wider."""
+        times = params.rotor_rise_time, params.rotor_fall_time
+        lags = inspect.unwrap(self.rotors) is inspect.unwrap(lagging_rotors) and all(map(is_concrete, times))
+        if lags and dt > (largest := 2 * min(float(np.asarray(time).min()) for time in times)):
+            raise UserError(
+                f"the physics step is {dt:.4g} s and rotors that lag by {largest / 2:.2g} s are stable up to "
+                f"{largest:.2g} s; give a shorter dt or more substeps, or rotors without a lag"
+            )
 
     @functools.cached_property
     def takes_scene(self) -> bool:

@@ -160,6 +160,7 @@ def make(
         if "drones" in task.contact and "drones" not in touched:
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
+        step.check_lag(nominal)
 
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)

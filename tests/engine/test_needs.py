@@ -186,3 +186,26 @@ def test_no_vehicle_gains_energy_by_contact_at_the_longest_step():
     of_tilts = jax.vmap(gain, (None, 0))
     gains = jit_unoptimized(jax.vmap(of_tilts, (0, None)))(params, jnp.array([0.0, 0.35, 0.8, 1.5]))
     assert gains.shape == (111, 4) and np.all(gains < 1e-3)
+
+
+@pytest.mark.parametrize("rotors", [jd.lagging_rotors, jd.failing(jd.lagging_rotors)])
+def test_rotors_whose_lag_is_too_short_for_the_step_are_refused(rotors):
+    """Their speed would swing ever wider about the command, also below zero."""
+    racer = jd.repeat(jd.load_params("racer"), 1)
+    longest = 2 * float(racer.rotor_rise_time[0])
+    for refused in (
+        lambda: jd.make_step(rotors=rotors, dt=1.1 * longest)(racer, START, STILL),
+        lambda: jax.jit(lambda rpm: jd.make_step(rotors=rotors, dt=1.1 * longest)(racer, START, rpm))(STILL),
+        lambda: jd.make("hover", vehicle="racer", rotors=rotors, control_hz=1 / (2.2 * longest), substeps=2),
+    ):
+        with pytest.raises(ValueError, match=r"step is 0\.044 s and rotors that lag by 0\.02 s are stable up to 0\.04"):
+            refused()
+
+
+def test_rotors_follow_at_the_longest_step_that_is_not_refused():
+    racer = jd.repeat(jd.load_params("racer"), 1)
+    step = jd.make_step(rotors=jd.lagging_rotors, dt=1.9 * float(racer.rotor_rise_time[0]))
+    state, command = START, jnp.full((1, 4), racer.hover_rpm[0])
+    for _ in range(100):
+        state = step(racer, state, command)
+    np.testing.assert_allclose(state.rpm, command, rtol=1e-3)

@@ -80,7 +80,9 @@ def _optimal(conditions: Conditions) -> Controller:
     one = functools.partial(module.control, settings, dt=conditions.dt)
 
     def init(params: Params, start: State) -> Any:
-        keys = jax.random.split(jax.random.key(conditions.seed or 0), n)
+        key = jax.random.key(conditions.seed or 0)
+        own_key = key if conditions.seed is None else jax.random.fold_in(key, 1)  # the start is drawn from `key`
+        keys = jax.random.split(own_key, n)
         own = (keys,) if module is optimal.mppi else ()
         return jax.vmap(functools.partial(module.init, settings))(params, start, *own)
 

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones import State, optimal
+from jaxdrones import State, load_params, optimal, repeat
 from jaxdrones.control import Setpoint
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
-from jaxdrones.flights.controllers import setpoints
+from jaxdrones.flights.controllers import controller_of, setpoints
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.results import diverged
@@ -103,6 +103,14 @@ def test_the_same_seed_is_the_same_flight_and_another_seed_another():
 
 
 @pytest.mark.slow
+def test_the_start_and_the_samples_of_a_seed_are_drawn_from_different_keys():
+    conditions = Conditions("circle", controller="mppi", seed=3)
+    team, start = repeat(load_params("cf2x"), conditions.drones), FLIGHTS["circle"].start(conditions.drones)
+    memory = controller_of(conditions).init(team, start)
+    of_start = jax.random.key_data(jax.random.split(jax.random.key(3), conditions.drones))
+    assert not np.any(np.all(jax.random.key_data(memory.key) == of_start, axis=-1))
+
+
 def test_progress_goes_from_nothing_to_all():
     told = []
     fly("circle", drones=1, duration=1.0, progress=told.append)

@@ -20,7 +20,7 @@ from jaxdrones.adapters.session import SEEDS, Session, as_env, as_numpy, flat, r
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.arguments import Count, checked
-from jaxdrones.checks import look_up, short_repr
+from jaxdrones.checks import check_whole, look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
@@ -212,8 +212,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         else:
             if len(seed) != self.num_envs:
                 raise UserError(f"seed has {len(seed)} entries; give one number, or one for each of {self.num_envs}")
-            given = [int(x) for x in seed if x is not None]
-            super().reset(seed=given[0] if given else None)
+            given = [x for x in seed if x is not None]
+            for x in given:
+                check_whole("an entry of seed", x, 0)
+            super().reset(seed=int(given[0]) if given else None)
             seeds = [int(self.np_random.integers(SEEDS)) if x is None else int(x) for x in seed]
         return np.array([seed % SEEDS for seed in seeds], np.uint32)
 

@@ -126,6 +126,9 @@ def test_mistakes_are_named(env_of):
         envs.reset(options={"reset_mask": np.ones(2, bool)})
     with pytest.raises(ValueError, match="seed has 2 entries; give one number, or one for each of 3"):
         envs.reset(seed=[1, 2])
+    for wrong in -1, 1.5:
+        with pytest.raises(ValueError, match=f"an entry of seed is {wrong}; give a whole number of at least 0"):
+            envs.reset(seed=[0, wrong, None])
     with pytest.raises(ValueError, match="unknown autoreset_mode 'Never'"):
         VectorEnv(short(env_of), 3, autoreset_mode="Never")
     with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'; did you mean 'height'"):

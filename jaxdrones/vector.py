@@ -19,7 +19,9 @@ def components(v: Float[Array, "n *shape"] | list[Float[Array, "*shape"]]) -> li
 
 def total(v: Float[Array, "n *shape"] | list[Float[Array, "*shape"]]) -> Float[Array, "*shape"]:
     """Sum of the components of a short vector, or of the rows of a short matrix."""
-    return cast(Array, sum(components(v))) if len(v) else jnp.zeros(v.shape[1:], v.dtype)
+    if isinstance(v, list) or len(v):
+        return cast(Array, sum(components(v)))
+    return jnp.zeros(v.shape[1:], v.dtype)
 
 
 def dot(a: Short, b: Short) -> Float[Array, ""]:

@@ -20,20 +20,24 @@ _MARGIN = 1e-3  # m: largest gap that counts as contact
 _ONE_IN = 8  # worlds: in forests and rooms usually fewer have something nearby
 
 
-def touches(world: World, before: Float[Array, "n 3"], scene: Scene | None = None) -> Collisions:
+def touches(
+    world: World, before: Float[Array, "n 3"], scene: Scene | None = None, *, passing: bool = False
+) -> Collisions:
     """Collision flags of a world by `jaxdrones.sensing.collisions`, with a sweep from the positions `before`.
 
-    Under `vmap`, only worlds with something within reach are computed. By default the scene is that of the world.
+    Under `vmap`, only worlds with something within reach are computed. By default the scene is that of the world. The
+    sweep is among obstacles, and with `passing` among the drones, too.
     """
     scene = world.scene if scene is None else scene
     args = jax.lax.stop_gradient((world.params, world.drones, before, scene))
-    return Collisions(*where_needed(_found, one_in=_ONE_IN)(jnp.any(_near(*args)), *args))
+    found = _found_also_passing if passing and len(before) > 1 else _found
+    return Collisions(*where_needed(found, one_in=_ONE_IN)(jnp.any(_near(*args)), *args))
 
 
 def advance(task: Task, world: World) -> dict[str, Array]:
     """Task variables after a step: positions `pos`, smallest `clearance` (m) so far, and whether a drone `touched`."""
     variables = world.variables
-    found = touches(world, variables["pos"])
+    found = touches(world, variables["pos"], passing=True)
     return variables | {
         "pos": world.drones.pos,
         "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
@@ -50,8 +54,6 @@ METRICS = {
 
 def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[Array, Array, Array]:
     found = collisions(params, drones, scene, _MARGIN)
-    if len(before) > 1:
-        found = found.replace(drones=found.drones | met_on_the_way(params, drones, before, _MARGIN))
     if not scene.has_obstacles:
         return found.ground, found.drones, found.scene
     kinds = merged(scene.shapes(before.dtype))
@@ -64,6 +66,11 @@ def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[
         return meets(kinds, start, end)
 
     return found.ground, found.drones, found.scene | jax.vmap(meets_obstacle)(params, drones, before)
+
+
+def _found_also_passing(params: Params, drones: State, before: Array, scene: Scene) -> tuple[Array, Array, Array]:
+    ground, others, obstacles = _found(params, drones, before, scene)
+    return ground, others | met_on_the_way(params, drones, before, _MARGIN), obstacles
 
 
 def _near(params: Params, drones: State, before: Array, scene: Scene) -> Bool[Array, " n"]:

@@ -15,6 +15,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.pairs import CORE, dot, nearby, nearest_on_the_way, seen_from, sums_with
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, distance
+from jaxdrones.tasks.touching import balls_meet
 
 SPEED = 1.2  # m/s, to the goal
 _SLOW_WITHIN = 0.8  # m of the goal
@@ -54,13 +55,13 @@ def advance(task: Task, world: World) -> dict[str, Array]:
     """Task variables after a step.
 
     Two drones touch when they come closer than both collision radii on the way, a drone and an obstacle when the center
-    of the drone is within a collision radius of it at a control step.
+    of the drone comes within a collision radius of it.
     """
     variables, pos = world.variables, world.drones.pos
     before = jnp.where(world.active[:, None], variables["pos"], pos)  # drones that left did not fly there
     touching = nearest_on_the_way(before, pos, nearby(pos, _SEEN), world.params.collision_radius) < 0
     if world.scene.has_obstacles:
-        touching |= shaping.gap(world) < 0
+        touching |= balls_meet(world, before)
     return variables | {"pos": pos, "touched": variables["touched"] | touching}
 
 

@@ -34,6 +34,32 @@ def touches(
     return Collisions(*where_needed(found, one_in=_ONE_IN)(jnp.any(_near(*args)), *args))
 
 
+def balls_meet(world: World, before: Float[Array, "n 3"]) -> Bool[Array, " n"]:
+    """Whether the ball of a collision radius about each drone met an obstacle or the ground on the straight way.
+
+    The way begins at the positions `before`. Obstacles are swept only in worlds in which one is within reach.
+    """
+    params, pos = world.params, world.drones.pos
+    gap = shaping.gap(world)
+
+    def swept(radius: Array, scene: Scene, before: Array, pos: Array) -> Array:
+        kinds, level, zero = (
+            merged(scene.shapes(pos.dtype)),
+            jnp.array([0.0, 0, 0, 1], pos.dtype),
+            jnp.zeros((), pos.dtype),
+        )
+
+        def meets_obstacle(radius: Array, before: Array, pos: Array) -> Array:
+            start, end = (Disc.of(at, level, zero, zero, radius) for at in (before, pos))
+            return meets(kinds, start, end)
+
+        return jax.vmap(meets_obstacle)(radius, before, pos)
+
+    within_reach = jnp.any(gap <= norm(pos - before))
+    args = jax.lax.stop_gradient((params.collision_radius, world.scene, before, pos))
+    return (gap < 0) | where_needed(swept, one_in=_ONE_IN)(within_reach, *args)
+
+
 def advance(task: Task, world: World) -> dict[str, Array]:
     """Task variables after a step: positions `pos`, smallest `clearance` (m) so far, and whether a drone `touched`."""
     variables = world.variables

@@ -91,6 +91,29 @@ def test_drones_that_pass_between_two_control_steps_have_touched():
         np.testing.assert_array_equal(env.task.measure(later)["safe"], [not touches, not touches, True])
 
 
+@pytest.mark.float32
+@pytest.mark.parametrize("speed", [1.0, 6.0, 20.0])
+def test_a_ball_that_is_passed_between_two_control_steps_has_been_touched(speed):
+    env = make("crowd", drones=2, obstacles=1.0)
+    _, world = jit_unoptimized(env.reset)(KEYS[1])
+    advance = jit_unoptimized(lambda now: env.task.advance(env.task, now)["touched"])
+    spheres = world.scene.spheres
+    ball = jnp.array([0.0, 0.0, 3.0])
+    spheres = spheres.replace(pos=spheres.pos.at[:].set(ball + jnp.array([0, 50.0, 0])).at[0].set(ball))
+    reach = float(spheres.radius[0] + env.params.collision_radius[0])
+    way = speed * env.dt
+    for share in (0.2, 0.5, 0.9):  # of the way, at which the drone is nearest to the ball
+        for gap, touches in ((0.98, True), (1.02, False)):
+            before = ball[None] + jnp.array([[-share * way, gap * reach, 0], [0, 9.0, 0]])
+            after = before.at[0, 0].add(way)
+            now = world.replace(
+                scene=world.scene.replace(spheres=spheres),
+                drones=world.drones.replace(pos=after),
+                variables=world.variables | {"pos": before, "touched": jnp.zeros(2, bool)},
+            )
+            np.testing.assert_array_equal(advance(now), [touches, False])
+
+
 def test_a_drone_that_left_the_world_touches_nobody_on_the_way():
     """Drones that leave are moved far along x, here past another one."""
     env = make("crowd", drones=3)

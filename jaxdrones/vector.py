@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Short = Float[Array, " n"] | list[Float[Array, ""]]
-"""A short vector, or the list of its components, which XLA's CPU compiler computes faster than a stacked vector."""
+"""A short vector, or the list of its components, which is faster on a CPU if they are computed anew."""
 
 
 def components(v: Float[Array, "n *shape"] | list[Float[Array, "*shape"]]) -> list[Float[Array, "*shape"]]:

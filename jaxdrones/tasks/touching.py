@@ -43,11 +43,8 @@ def balls_meet(world: World, before: Float[Array, "n 3"]) -> Bool[Array, " n"]:
     gap = shaping.gap(world)
 
     def swept(radius: Array, scene: Scene, before: Array, pos: Array) -> Array:
-        kinds, level, zero = (
-            merged(scene.shapes(pos.dtype)),
-            jnp.array([0.0, 0, 0, 1], pos.dtype),
-            jnp.zeros((), pos.dtype),
-        )
+        kinds = merged(scene.shapes(pos.dtype))
+        zero, level = jnp.zeros((), pos.dtype), jnp.array([0.0, 0, 0, 1], pos.dtype)
 
         def meets_obstacle(radius: Array, before: Array, pos: Array) -> Array:
             start, end = (Disc.of(at, level, zero, zero, radius) for at in (before, pos))

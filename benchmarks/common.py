@@ -1,6 +1,7 @@
 """Versions, machine and commit, timers, and a figure with logarithmic axes."""
 
 import os
+import shutil
 import statistics
 import subprocess
 import time
@@ -16,14 +17,21 @@ from jaxdrones.learning.evaluation import Report
 
 def about() -> dict[str, object]:
     """Versions, machine and commit: what a number means nothing without."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     return {
-        "commit": commit.stdout.strip(),
+        "commit": _commit(),
         **{name: text for name, text in versions().items() if name in ("jax", "jaxlib", "python")},
         "device": str(jax.devices()[0]),
         "cpu": processor(),
         "cores": os.cpu_count(),
     }
+
+
+def _commit() -> str:
+    """Short hash of the checked out commit; empty in a copy of the files without git."""
+    if shutil.which("git") is None:
+        return ""
+    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return found.stdout.strip()
 
 
 def compiled(function, *arguments, options: dict | None = None):

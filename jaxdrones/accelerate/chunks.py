@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.fitting import fits_a_kernel, gains_by_chunks
+from jaxdrones.accelerate.compiler import is_cpu
+from jaxdrones.accelerate.fitting import fits_a_kernel, fits_number_by_number, gains_by_chunks
 from jaxdrones.accelerate.reordered import has_reordered, store_reordered
 from jaxdrones.accelerate.soa import vmap_for_kernel
 from jaxdrones.arguments import Count, checked
@@ -59,8 +60,8 @@ class ChunkedProgram:
 
     @functools.cached_property
     def fits_a_kernel(self) -> bool:
-        """Whether it can be a single kernel."""
-        return fits_a_kernel(self.program)
+        """Whether it can be a single kernel; on an accelerator, whether its loops can be a few kernels per iteration."""
+        return fits_a_kernel(self.program) and (is_cpu() or fits_number_by_number(self.program))
 
     def by_vmap(self, *leaves: Array) -> list[Array]:
         """Results for many worlds by `jax.vmap`, chunk by chunk where that is faster."""
@@ -69,27 +70,32 @@ class ChunkedProgram:
     def by_one_kernel(self, *leaves: Array) -> list[Array]:
         """Results for many worlds, chunk by chunk in a single kernel. Derivatives are those of `by_vmap`.
 
+        On an accelerator, whose threads share the worlds, there are no chunks.
+
         Raises:
             NoKernelError: the program cannot be a single kernel.
         """
 
+        def of_worlds(consts, leaves):
+            last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
+            return [jnp.moveaxis(x, -1, 0) for x in vmap_for_kernel(self.program, consts, last)]
+
         @as_one_kernel
         def chunks(consts, leaves):
-            def of_a_chunk(*leaves):
-                last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
-                return [jnp.moveaxis(x, -1, 0) for x in vmap_for_kernel(self.program, consts, last)]
-
-            return _chunks(of_a_chunk, leaves, self.along, self.chunk or _KERNEL_CHUNK)
+            size = self.chunk or _KERNEL_CHUNK
+            return _chunks(lambda *leaves: of_worlds(consts, leaves), leaves, self.along, size)
 
         @jax.custom_jvp
         def flown(consts, leaves):
+            if not is_cpu():
+                return of_worlds(consts, leaves)
             return [_joined(x, self._worlds(leaves)) for x in chunks(consts, leaves)]
 
         flown.defjvp(lambda inputs, tangents: jax.jvp(self._by_vmap, inputs, tangents))
         return flown(self.consts, leaves)
 
     def _by_vmap(self, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
-        in_chunks = gains_by_chunks(self.program)
+        in_chunks = is_cpu() and gains_by_chunks(self.program)
         evaluate = store_reordered if in_chunks and has_reordered(self.program) else _as_it_is
         of_many = jax.vmap(functools.partial(evaluate, self.program, consts), self.along)
         if not in_chunks:

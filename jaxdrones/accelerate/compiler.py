@@ -43,6 +43,11 @@ CALLS = PLAIN_CALLS | frozenset("remat remat2 checkpoint custom_jvp_call custom_
 """Plain calls, and calls with derivative rules."""
 
 
+def is_cpu() -> bool:
+    """Whether the default device of JAX is a CPU."""
+    return jax.default_backend() == "cpu"
+
+
 class UnknownError(Exception):
     """Unknown form of a traced program."""
 
@@ -76,7 +81,7 @@ def training_options(large_arrays: bool) -> dict[str, Any]:
 
 @functools.cache
 def _known(**options: Any) -> dict[str, Any]:
-    if jax.default_backend() != "cpu":
+    if not is_cpu():
         return {}
     return {name: value for name, value in options.items() if _is_supported(name, value)}
 

@@ -14,6 +14,10 @@ Arrays of four drones fill the vectors of a CPU without a split."""
 _MAX_NUMBERS = 8_000
 """Largest number of entries in the loops of a program to split: they compile in about 15 s."""
 
+_MAX_AT_ONCE = 2_600
+"""Largest number of entries of several iterations of a loop in one kernel of an accelerator: they compile in about 5 s.
+Starting a kernel takes as long as some 40 iterations of the physics within it."""
+
 _MANY_NUMBERS = 1_000
 """Size of an array of which those of all worlds may not fit in the cache."""
 
@@ -81,6 +85,15 @@ def fits_number_by_number(program: Any) -> bool:
     """Whether the loops of a program have few enough entries to split."""
     sizes = list(_sizes_in_loops(program))
     return max(sizes, default=0) <= LARGEST and sum(sizes) <= _MAX_NUMBERS
+
+
+def iterations_at_once(program: Any, length: int) -> int:
+    """Number of iterations of a loop in one kernel of an accelerator, a divisor of `length`; one with inner loops."""
+    if _has_loop(program):
+        return 1
+    numbers = sum(v.aval.size for eqn in _equations(program) if not any(compiler.held(eqn)) for v in eqn.outvars)
+    most = max(1, min(length, _MAX_AT_ONCE // max(numbers, 1)))
+    return next(count for count in range(most, 0, -1) if length % count == 0)
 
 
 def _has_loop(program: Any) -> bool:

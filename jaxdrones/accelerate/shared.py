@@ -29,7 +29,7 @@ def materialize_shared(function: Callable) -> Callable:
     """
 
     def materialized(*arguments):
-        if jax.default_backend() != "cpu" or not compiler.AVAILABLE:
+        if not compiler.is_cpu() or not compiler.AVAILABLE:
             return function(*arguments)
         return _store_shared(function, _MIN_SAVED_BETWEEN_KERNELS)(*stored_for_derivatives(arguments))
 

@@ -17,7 +17,7 @@ def jit_small(function: Callable, static: int = 0) -> Callable:
     `static` arguments are static. The result cannot be called inside another traced function.
     """
     programs = [jax.jit(function, static_argnums=tuple(range(static)))]
-    if compiler.AVAILABLE and jax.default_backend() == "cpu":
+    if compiler.AVAILABLE and compiler.is_cpu():
         kernel = in_one_kernel(function, static)
         options = compiler.small_options()
         programs.append(jax.jit(kernel, static_argnums=tuple(range(static)), compiler_options=options))

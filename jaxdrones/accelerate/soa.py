@@ -1,8 +1,9 @@
-"""Structure of arrays over worlds, for a single kernel of XLA's CPU compiler.
+"""Structure of arrays over worlds, for a single kernel of XLA's CPU compiler and for few kernels on an accelerator.
 
 `jax.vmap` batches a velocity to an array (worlds, 3). XLA's CPU compiler shuffles vectors for each use of a component,
-and recomputes common subexpressions. Here every entry is a separate array (worlds,), so stacking, splitting and
-transposing are free, and common subexpressions are stored once.
+and recomputes common subexpressions. On a GPU each array is a kernel, and an iteration of a loop waits for all of them.
+Here every entry is a separate array (worlds,), so stacking, splitting and transposing are free, common subexpressions
+are stored once, and the arithmetic of an iteration is one kernel.
 """
 
 import functools
@@ -24,6 +25,7 @@ from jaxdrones.accelerate.fitting import (
     SHAPES,
     NoKernelError,
     fits_number_by_number,
+    iterations_at_once,
 )
 from jaxdrones.accelerate.layout import Value, Whole, apart, number_by_number, of_numbers, product, reduced, whole
 from jaxdrones.accelerate.reordered import store_reordered
@@ -133,6 +135,8 @@ def _scan(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
         after, _ = jax.eval_shape(body, carry, [jax.eval_shape(lambda x: x[0], stack.x) for stack in stacks])
         grown = jax.tree.map(_grown, carry, after)
     options = {name: eqn.params[name] for name in ("length", "reverse", "unroll")}
+    if not compiler.is_cpu():
+        options["unroll"] = max(options["unroll"], iterations_at_once(program, options["length"]))
     carry, ys = jax.lax.scan(advance, carry, [stack.x for stack in stacks], **options)
     of_ys = zip(ys, eqn.outvars[carried:], strict=True)
     return [*from_carry(carry), *(Whole(y, y.ndim > v.aval.ndim) for y, v in of_ys)]

@@ -15,7 +15,7 @@ def stored(tree: Any) -> Any:
     The compiler would otherwise recompute it in every expression, or read it from the stack of a `scan`, which is not
     vectorized. It does not fuse across calls, so this is an empty call.
     """
-    return compiler.set_notes(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
+    return compiler.set_notes(_same(tree), inlineable="false") if compiler.is_cpu() else tree
 
 
 @jax.custom_jvp

@@ -34,8 +34,9 @@ def over_worlds(
     take derivatives inside, `over_worlds(jax.grad(miss))`.
 
     On a CPU the worlds are computed in chunks that fit in the cache. A function of loops and arithmetic, such as a
-    flight or its gradient, is compiled to a single kernel on one core. With sorting, large matrix products, solvers,
-    random numbers or branches it is compiled as usual; so it is, with a warning, if the single kernel does not compile.
+    flight or its gradient, is compiled to a single kernel on one core; on an accelerator each iteration of its loops is
+    one or a few kernels. With sorting, large matrix products, solvers, random numbers or branches it is compiled as
+    usual; so it is, with a warning, if the single kernel does not compile.
 
     Args:
         function: function of one world; it may close over values common to all worlds.
@@ -123,7 +124,7 @@ class _ManyWorlds:
         return True
 
     def _can_be_kernel(self, arguments: tuple) -> bool:
-        if jax.default_backend() != "cpu" or not _is_able():
+        if not _is_able():
             return False
         return not self._without_kernel or _shapes(arguments) not in self._without_kernel
 
@@ -145,7 +146,7 @@ class _ManyWorlds:
             )
         if not worlds:
             return jax.vmap(self._function, axes)(*arguments)
-        if jax.default_backend() != "cpu" or not compiler.AVAILABLE:
+        if not compiler.AVAILABLE:
             return self._shared(jax.vmap(self._function, axes), axes)(*arguments)
 
         leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))

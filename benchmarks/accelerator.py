@@ -137,13 +137,14 @@ def tests(quick: bool) -> Iterator[Row]:
     """How many tests of each file pass, and which fail; several processes share the memory of the accelerator."""
     files = FEW_TESTS if quick else TESTS
     command = [sys.executable, "-m", "pytest", "-q", *files, "-m", "not slow", f"--numprocesses={cores()}"]
+    command += ["-p", "no:benchmark"]  # a plugin that warns of several processes, and warnings are errors
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         sharing = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-        subprocess.run(
-            [*command, f"--junitxml={report}"], cwd=ROOT, env=sharing, stdout=subprocess.DEVNULL, check=False
-        )
+        said = subprocess.run([*command, f"--junitxml={report}"], cwd=ROOT, env=sharing, capture_output=True, text=True)
+        if not report.exists():
+            raise RuntimeError(f"pytest did not run: {(said.stdout + said.stderr).strip().splitlines()[-1:]}")
         cases = list(ElementTree.parse(report).iter("testcase"))
     note = f"all files in {time.monotonic() - start:.0f} s"
     for file in files:

@@ -60,7 +60,7 @@ class ChunkedProgram:
 
     @functools.cached_property
     def fits_a_kernel(self) -> bool:
-        """Whether it can be a single kernel; on an accelerator, whether its loops can be a few kernels per iteration."""
+        """Whether it can be a single kernel, or on an accelerator a few kernels per iteration of its loops."""
         return fits_a_kernel(self.program) and (is_cpu() or fits_number_by_number(self.program))
 
     def by_vmap(self, *leaves: Array) -> list[Array]:
@@ -80,16 +80,11 @@ class ChunkedProgram:
             last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
             return [jnp.moveaxis(x, -1, 0) for x in vmap_for_kernel(self.program, consts, last)]
 
-        @as_one_kernel
-        def chunks(consts, leaves):
-            size = self.chunk or _KERNEL_CHUNK
-            return _chunks(lambda *leaves: of_worlds(consts, leaves), leaves, self.along, size)
-
         @jax.custom_jvp
         def flown(consts, leaves):
             if not is_cpu():
                 return of_worlds(consts, leaves)
-            return [_joined(x, self._worlds(leaves)) for x in chunks(consts, leaves)]
+            return kernel_of_chunks(of_worlds, consts, leaves, self._worlds(leaves), self.along, self.chunk)
 
         flown.defjvp(lambda inputs, tangents: jax.jvp(self._by_vmap, inputs, tangents))
         return flown(self.consts, leaves)
@@ -105,6 +100,24 @@ class ChunkedProgram:
 
     def _worlds(self, leaves: Sequence[Array]) -> int:
         return leaves[0].shape[self.along[0]]
+
+
+def kernel_of_chunks(
+    function: Callable,
+    consts: Sequence[Array],
+    leaves: Sequence[Array],
+    worlds: int,
+    axes: Sequence[int] | None = None,
+    chunk: int | None = None,
+) -> list[Array]:
+    """Results of `function(consts, leaves)`, chunk by chunk in a single kernel; leaves have worlds on their `axes`."""
+    along = (0,) * len(leaves) if axes is None else tuple(axes)
+
+    @as_one_kernel
+    def chunks(consts, leaves):
+        return _chunks(lambda *leaves: function(consts, leaves), leaves, along, chunk or _KERNEL_CHUNK)
+
+    return [_joined(x, worlds) for x in chunks(consts, leaves)]
 
 
 def _as_it_is(program: Any, consts: Sequence[Array], *inputs: Array) -> list[Array]:

@@ -39,8 +39,8 @@ Variable = Any
 PLAIN_CALLS = frozenset("jit pjit closed_call core_call".split())
 """Primitives that only call a program."""
 
-CALLS = PLAIN_CALLS | frozenset("remat remat2 checkpoint custom_jvp_call custom_vjp_call".split())
-"""Plain calls, and calls with derivative rules."""
+CALLS = PLAIN_CALLS | frozenset("apart remat remat2 checkpoint custom_jvp_call custom_vjp_call".split())
+"""Plain calls, and calls with rules of their own under derivatives or `jax.vmap`."""
 
 
 def is_cpu() -> bool:
@@ -152,6 +152,16 @@ def trace(function: Callable, *arguments: Any) -> tuple[Any, list, Any]:
     return *opened(closed), shape
 
 
+def trace_open(function: Callable, *arguments: Any) -> tuple[Any, list, Any]:
+    """Program of a function without closed-over values, its inputs that replace them, and the shapes of its result."""
+    program, consts, shape = trace(function, *arguments)
+    return (
+        _program([*program.constvars, *program.invars], program.outvars, program.eqns, program.effects),
+        consts,
+        shape,
+    )
+
+
 def opened(program: Any) -> tuple[Any, list]:
     """Program and its closed-over values; one object since JAX 0.12."""
     if hasattr(program, "consts"):
@@ -171,8 +181,12 @@ def as_function(program: Any, consts: Sequence) -> Callable[..., list]:
 
 def alone(equation: Equation, variables: Iterable[Variable], results: Iterable[Variable]) -> Callable[..., list]:
     """Function from some variables of an equation to some of its results."""
-    parts = dict(invars=[*variables], outvars=[*results], eqns=[equation], effects=equation.effects)
-    return as_function(opened(_nothing())[0].replace(**parts), ())
+    return as_function(_program(variables, results, [equation], equation.effects), ())
+
+
+def _program(inputs: Iterable, results: Iterable, equations: Sequence[Equation], effects: Any) -> Any:
+    parts = dict(invars=[*inputs], outvars=[*results], eqns=equations, effects=effects)
+    return opened(_nothing())[0].replace(**parts)
 
 
 @functools.cache
@@ -196,7 +210,7 @@ def held(equation: Equation) -> Iterator[Any]:
 
 def called(equation: Equation) -> tuple[Any, list]:
     """Program of an equation with a primitive of `CALLS`."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr", "program"):
         if name in equation.params:
             return opened(equation.params[name])
     raise UnknownError(f"{equation.primitive.name} holds no program")

@@ -44,11 +44,25 @@ def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Arra
     if not fits_number_by_number(program):
         return jax.vmap(functools.partial(store_reordered, program, consts, rules=_RULES), -1, -1)(*leaves)
 
-    def evaluated(consts, leaves):
-        results = _evaluate(program, [Whole(x, False) for x in consts], [Whole(x, True) for x in leaves])
-        return [whole(value).in_all_worlds(leaves[0].shape[-1]) for value in results]
+    return over_last_axis(program, leaves, [True] * len(leaves), consts)
 
-    return store_shared(evaluated)(list(consts), list(leaves))
+
+def over_last_axis(
+    program: Any, inputs: Sequence[Array], varies: Sequence[bool], consts: Sequence[Array] = ()
+) -> list[Array]:
+    """Evaluate a program of one world number by number, with the worlds last in the results and varying inputs.
+
+    Raises:
+        NoKernelError: the program cannot be a single kernel.
+    """
+    worlds = next(x.shape[-1] for x, each in zip(inputs, varies, strict=True) if each)
+
+    def evaluated(consts, inputs):
+        of_worlds = [Whole(x, each) for x, each in zip(inputs, varies, strict=True)]
+        results = _evaluate(program, [Whole(x, False) for x in consts], of_worlds)
+        return [whole(value).in_all_worlds(worlds) for value in results]
+
+    return store_shared(evaluated)(list(consts), list(inputs))
 
 
 def _evaluate(program: Any, consts: Sequence[Value], inputs: Sequence[Value]) -> list[Value]:

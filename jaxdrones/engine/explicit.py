@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxdrones.accelerate.apart import apart_under_vmap
 from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.arguments import Count, Seconds, checked
 from jaxdrones.checks import check_params, check_quaternion
@@ -164,6 +165,7 @@ class ExplicitStep(Step):
             check_team(params, state, command)
             return command
 
+        @apart_under_vmap
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = commanded(params, state, rpm)
             state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))

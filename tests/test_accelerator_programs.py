@@ -1,15 +1,17 @@
 """Programs for an accelerator, lowered on a machine without one: nothing that is meant for CPUs is in them."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax import export
 
 import jaxdrones as jd
 from benchmarks.cameras_scenes import objects20, poses
-from jaxdrones.accelerate import compiler
+from jaxdrones.accelerate import compiler, fitting
 from jaxdrones.learning import compilation
 from jaxdrones.training import presets
 from jaxdrones.training.algorithms import ALGORITHMS, learner
@@ -84,11 +86,69 @@ def test_the_plant_and_its_gradient_hold_nothing_for_cpus(accelerator):
     assert gradient.count("optimization_barrier") <= 1  # of jax.checkpoint; none that only forces storage
 
 
-def test_over_worlds_is_vmap_on_an_accelerator(accelerator):
-    """No chunks, which are loops over worlds."""
+def test_a_step_over_worlds_is_no_loop_over_worlds_on_an_accelerator(accelerator):
     program = lowered(jd.over_worlds(fly), *worlds())
     assert not found(program) and "stablehlo.while" not in program
-    assert program.count("stablehlo.") == lowered(jax.vmap(fly), *worlds()).count("stablehlo.")
+
+
+def flight(state, rpm, length=12):
+    """Final position after 12 steps with the same command."""
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    return jax.lax.scan(lambda state, _: (STEP(params, state, rpm), None), state, length=length)[0].pos
+
+
+def miss(state, rpms):
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    return jnp.sum(jax.lax.scan(lambda state, rpm: (STEP(params, state, rpm), None), state, rpms)[0].pos ** 2)
+
+
+def of_loops(program: str) -> set[str]:
+    """Types of the numbers that the arithmetic of a program's loops and functions is of."""
+    _, _, loops = program.partition("stablehlo.while")
+    return set(re.findall(r"stablehlo\.(?:add|multiply|subtract) .*: tensor<(\w+)>", loops))
+
+
+def test_the_loop_of_a_flight_on_an_accelerator_is_of_one_array_per_number(accelerator):
+    """Each array of `vmap`, (worlds, 1, 3), would be a kernel of its own."""
+    program = lowered(jd.over_worlds(flight), *worlds())
+    assert not found(program) and of_loops(program) == {"8xf32", "f32", "i32"}
+
+
+def test_a_step_within_vmap_on_an_accelerator_is_of_one_array_per_number(accelerator):
+    step = jd.make_step(effects=(jd.drag,), rotors=jd.lagging_rotors, substeps=3)
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    program = lowered(jax.vmap(lambda state, rpm: step(params, state, rpm)), *worlds())
+    assert not found(program) and of_loops(program) == {"8xf32", "f32", "i32"}
+
+
+def test_flights_and_gradients_over_worlds_on_an_accelerator_are_those_of_vmap():
+    states, rpm = worlds()
+    rpms = jnp.stack([rpm * (1 + 0.01 * k) for k in range(6)], axis=1)
+    gradient = jax.value_and_grad(miss, 1)
+    expected = jax.jit(jax.vmap(flight))(states, rpm), jax.jit(jax.vmap(gradient))(states, rpms)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "gpu")
+        _forget()
+        around = jax.jit(jax.grad(lambda rpms: jnp.sum(jd.over_worlds(miss)(states, rpms))))(rpms)
+        flown = jd.over_worlds(flight)(states, rpm), jd.over_worlds(gradient)(states, rpms)
+    _forget()
+    for ours, theirs in zip(jax.tree.leaves((flown, around)), jax.tree.leaves((expected, expected[1][1])), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5 * np.abs(theirs).max())
+
+
+def test_several_iterations_of_a_loop_are_a_kernel_and_divide_its_length():
+    def looped(numbers, inner=1):
+        def body(x, _):
+            x = jax.lax.scan(lambda x, _: (jnp.sin(x), None), x, length=inner)[0] if inner > 1 else jnp.sin(x)
+            return x, None
+
+        program = jax.make_jaxpr(lambda x: body(x, None)[0])(jnp.zeros(numbers))
+        return lambda length: fitting.iterations_at_once(program.jaxpr, length)
+
+    of_a_third = looped(fitting._MAX_AT_ONCE // 3)
+    assert [of_a_third(length) for length in (1, 2, 3, 4, 7, 9, 100)] == [1, 2, 3, 2, 1, 3, 2]
+    assert looped(2 * fitting._MAX_AT_ONCE)(12) == 1
+    assert looped(1, inner=3)(12) == 1
 
 
 def test_an_environment_step_holds_nothing_for_cpus(accelerator):

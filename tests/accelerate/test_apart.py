@@ -1,0 +1,147 @@
+"""A function whose numbers are apart under `vmap` is what `vmap` computes, and so are all of its derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import flying, tape
+
+import jaxdrones as jd
+from jaxdrones.accelerate.apart import apart_under_vmap
+
+rng = np.random.default_rng(0)
+X, PUSH = jnp.asarray(rng.normal(size=(5, 3))), jnp.asarray(rng.normal(size=(5, 3)))
+
+
+@jax.custom_jvp
+def softened(x):
+    """Three times its slope is told to whoever differentiates it."""
+    return jnp.tanh(x)
+
+
+softened.defjvp(lambda x, change: (softened(*x), 3 * change[0] * (1 - jnp.tanh(x[0]) ** 2)))
+
+
+def swung(x, push, soft=softened):
+    """A loop with a carried array, a product, a rule of its own for derivatives, and a number of steps."""
+    arm = jnp.array([[0.0, 1.0, 0.5], [-1.0, 0.0, 2.0], [0.3, 0.2, 1.0]])
+
+    def advance(carry, k):
+        x, count = carry
+        return (x + 0.1 * soft(arm @ x + push) * jnp.cos(k), count + (x[0] > 0)), x[1]
+
+    (x, count), seen = jax.lax.scan(advance, (x, 0), jnp.arange(4.0))
+    return {"end": x, "seen": seen, "count": count}
+
+
+smooth = functools.partial(swung, soft=jnp.tanh)
+
+
+def total(function, x, push):
+    out = function(x, push)
+    return jnp.sum(out["end"] ** 2) + jnp.sum(jnp.sin(out["seen"]))
+
+
+def same(found, expected):
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
+
+
+MANY = {
+    "both vary": (lambda f: jax.vmap(f), (X, PUSH)),
+    "one varies": (lambda f: jax.vmap(f, (0, None)), (X, PUSH[0])),
+    "along the last axis": (lambda f: jax.vmap(f, (-1, 0)), (X.T, PUSH)),
+    "worlds of worlds": (lambda f: jax.vmap(jax.vmap(f, (None, 0)), (0, None)), (X, PUSH)),
+    "worlds of worlds, both": (lambda f: jax.vmap(jax.vmap(f, (0, None)), (0, 0)), (jnp.stack([X, 2 * X]), PUSH[:2])),
+    "one world": (lambda f: f, (X[0], PUSH[0])),
+}
+
+
+@pytest.mark.parametrize("name", MANY)
+def test_results_are_those_of_vmap(name):
+    many, arguments = MANY[name]
+    same(jax.jit(many(apart_under_vmap(swung)))(*arguments), many(swung)(*arguments))
+
+
+DERIVATIVES = {
+    "grad": (swung, lambda f: jax.grad(f, (0, 1))),
+    "of one argument": (swung, lambda f: jax.grad(f, 1)),
+    "jacfwd": (swung, jax.jacfwd),
+    "recomputed": (swung, lambda f: jax.grad(jax.checkpoint(f))),
+    "hessian": (smooth, jax.hessian),
+    "grad of grad": (smooth, lambda f: jax.grad(lambda x, push: jnp.sum(jax.grad(f)(x, push) * push))),
+}
+
+
+@pytest.mark.parametrize("name", DERIVATIVES)
+@pytest.mark.parametrize("of", ["both vary", "one varies", "one world"])
+def test_derivatives_are_those_of_vmap(name, of):
+    """Also where a function has a rule of its own, which second derivatives follow in two ways."""
+    many, arguments = MANY[of]
+    function, derivative = DERIVATIVES[name]
+    ours, theirs = (many(derivative(functools.partial(total, f))) for f in (apart_under_vmap(function), function))
+    same(jax.jit(ours)(*arguments), jax.jit(theirs)(*arguments))
+
+
+def test_a_derivative_around_all_worlds_sums_over_those_that_share_an_argument():
+    def of_all(function, x, push):
+        return jnp.sum(jax.vmap(functools.partial(total, function), (0, None))(x, push))
+
+    ours, theirs = (jax.jit(jax.grad(functools.partial(of_all, f), (0, 1))) for f in (apart_under_vmap(swung), swung))
+    same(ours(X, PUSH[0]), theirs(X, PUSH[0]))
+
+
+def test_what_it_closes_over_may_be_traced():
+    def scaled(function, scale):
+        inner = apart_under_vmap(lambda x: {"end": scale * x**3, "seen": x}) if function else None
+        return jnp.sum(jax.vmap(inner or (lambda x: {"end": scale * x**3, "seen": x}))(X)["end"])
+
+    slope = jax.jit(jax.grad(functools.partial(scaled, True)))(2.0)
+    np.testing.assert_allclose(slope, jnp.sum(X**3), rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [3, 50], ids=["sorting", "large arrays"])
+def test_what_cannot_be_apart_is_as_vmap_computes_it(size):
+    x = jnp.asarray(rng.normal(size=(4, size)))
+
+    def function(x):
+        return jax.lax.scan(lambda x, _: (jnp.sort(x) if size == 3 else 0.9 * x, None), x, length=3)[0]
+
+    ours = jax.jit(jax.vmap(apart_under_vmap(function)))
+    assert "small_call" not in ours.lower(x).as_text()
+    np.testing.assert_array_equal(ours(x), jax.vmap(function)(x))
+
+
+def test_many_worlds_are_one_kernel_and_one_world_is_none():
+    function = apart_under_vmap(swung)
+    assert jax.jit(jax.vmap(function)).lower(X, PUSH).as_text().count("small_call") == 1
+    assert "small_call" not in jax.jit(function).lower(X[0], PUSH[0]).as_text()
+
+
+@pytest.mark.slow
+def test_the_gradient_of_a_flight_in_vmap_is_that_of_one_world_at_a_time():
+    """With parameters of its own in every world, and a command between that depends on the state."""
+    params = jd.repeat(jd.load_params("cf2x"), 2)
+    step = jd.make_step((jd.drag, jd.ground_effect), pairs=(jd.downwash,), rotors=jd.lagging_rotors, substeps=3)
+
+    def miss(mass, start, commands):
+        own = params.replace(mass=mass)
+
+        def advance(state, command):
+            return step(own, state, command - 100 * state.vel[:, 2:]), None
+
+        return jnp.sum(jax.lax.scan(advance, start, commands)[0].pos ** 2)
+
+    starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(flying(params, seed) for seed in range(3)))
+    masses = params.mass[None] * jnp.array([[1.0], [1.1], [0.9]])
+    commands = jnp.stack([tape(params, 4, seed) for seed in range(3)])
+    gradient = jax.value_and_grad(miss, (0, 1, 2))
+    at_once = jax.jit(jax.vmap(gradient))(masses, starts, commands)
+    one = jax.jit(gradient)
+    for i in range(3):
+        alone = one(*jax.tree.map(lambda x, i=i: x[i], (masses, starts, commands)))
+        for ours, theirs in zip(jax.tree.leaves(at_once), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(ours[i], theirs, rtol=0, atol=1e-12 * max(1, np.abs(theirs).max()))

@@ -114,6 +114,14 @@ def test_the_loop_of_a_flight_on_an_accelerator_is_of_one_array_per_number(accel
     assert not found(program) and of_loops(program) == {"8xf32", "f32", "i32"}
 
 
+def test_a_kernel_of_an_accelerator_has_as_many_steps_as_divide_the_flight(accelerator):
+    def steps(length):
+        of_length = functools.partial(flight, length=length)
+        return lowered(jd.over_worlds(of_length), *worlds()).count("stablehlo.sqrt")
+
+    assert steps(12) == 4 * steps(11) > 0
+
+
 def test_a_step_within_vmap_on_an_accelerator_is_of_one_array_per_number(accelerator):
     step = jd.make_step(effects=(jd.drag,), rotors=jd.lagging_rotors, substeps=3)
     params = jd.repeat(jd.load_params("cf2x"), 1)

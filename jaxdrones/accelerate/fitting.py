@@ -14,7 +14,7 @@ Arrays of four drones fill the vectors of a CPU without a split."""
 _MAX_NUMBERS = 8_000
 """Largest number of entries in the loops of a program to split: they compile in about 15 s."""
 
-_MAX_AT_ONCE = 2_600
+_MAX_AT_ONCE = 3_700
 """Largest number of entries of several iterations of a loop in one kernel of an accelerator: they compile in about 5 s.
 Starting a kernel takes as long as some 40 iterations of the physics within it."""
 

@@ -20,14 +20,13 @@ from pathlib import Path
 
 from benchmarks import published
 from benchmarks.common import about
-from jaxdrones.cli.machine import cores
+from jaxdrones.cli.machine import cores, devices
 
 ROOT = Path(__file__).parent.parent
 SHARES = {"tests": 0.25, "plant": 0.25, "cameras": 0.1, "envs": 0.1, "swarm": 0.1, "learning": 0.2}
 """Of the time; what a section leaves, the next ones have."""
 
 TESTS = (
-    "tests/accelerate/test_devices.py",
     "tests/engine/test_golden.py",
     "tests/engine/test_explicit.py",
     "tests/engine/test_gradients.py",
@@ -35,6 +34,7 @@ TESTS = (
     "tests/dynamics/test_aero.py",
     "tests/sensing/test_images.py",
 )
+DEVICE_TESTS = ("tests/accelerate/test_devices.py",)  # all of them slow
 FEW_TESTS = ("tests/test_wrench.py",)
 WORLDS = (262_144, 16_384, 65_536, 1_024, 1_048_576)  # the first ones are what the figures of others are for
 MOST_WITH_GRADIENT = 262_144  # a few GiB
@@ -123,7 +123,7 @@ def measure(options: argparse.Namespace) -> None:
     """Write a line for each measurement as soon as it is made."""
     for section in options.sections:
         if section != "tests":  # they need the accelerator for themselves
-            write(options.rows, {"about": about()})
+            write(options.rows, {"about": about() | {"device": devices()[0]}})
         for found in MEASURES[section](options.quick):
             write(options.rows, {"section": section} | found)
 
@@ -135,8 +135,13 @@ def write(file: Path, found: Row) -> None:
 
 def tests(quick: bool) -> Iterator[Row]:
     """How many tests of each file pass, and which fail; several processes share the memory of the accelerator."""
-    files = FEW_TESTS if quick else TESTS
-    command = [sys.executable, "-m", "pytest", "-q", *files, "-m", "not slow", f"--numprocesses={cores()}"]
+    for files, which in [(FEW_TESTS, "not slow")] if quick else [(TESTS, "not slow"), (DEVICE_TESTS, "slow")]:
+        yield from tested(files, which)
+
+
+def tested(files: Sequence[str], which: str) -> Iterator[Row]:
+    """How many tests of each file with these marks pass, and which fail."""
+    command = [sys.executable, "-m", "pytest", "-q", *files, "-m", which, f"--numprocesses={cores()}"]
     command += ["-p", "no:benchmark"]  # a plugin that warns of several processes, and warnings are errors
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:

@@ -124,7 +124,7 @@ def test_a_kernel_of_an_accelerator_has_as_many_steps_as_divide_the_flight(accel
 
 
 def test_a_step_within_vmap_on_an_accelerator_is_of_one_array_per_number(accelerator):
-    step = jd.make_step(effects=(jd.drag,), rotors=jd.lagging_rotors, substeps=3)
+    step = jd.make_step(effects=(jd.drag,), rotors=jd.lagging_rotors, substeps=11)
     params = jd.repeat(jd.load_params("cf2x"), 1)
     program = lowered(jax.vmap(lambda state, rpm: step(params, state, rpm)), *worlds())
     assert not found(program) and of_loops(program) == {"8xf32", "f32", "i32"}
@@ -166,6 +166,16 @@ def test_an_environment_step_holds_nothing_for_cpus(accelerator):
     _, episode = jax.eval_shape(episodes.reset, key)
     action = jnp.zeros((1, episodes.env.action_size))
     assert not found(lowered(episodes.step, key, episode, action))
+
+
+def test_an_environment_multiplies_matrices_in_the_precision_of_their_type():
+    """A GPU would round the positions of a race to millimeters."""
+    env = jd.make("race")
+    _, world = jax.eval_shape(env.reset, jax.random.key(0))
+    action = jnp.zeros((env.drones, env.action_size))
+    for program in lowered(env.reset, jax.random.key(0)), lowered(env.step, jax.random.key(0), world, action):
+        products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]
+        assert products and all("[HIGHEST, HIGHEST]" in line for line in products)
 
 
 @pytest.mark.slow

@@ -32,6 +32,16 @@ RowSet = tuple[int, int, int, float]
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 
 
+def in_full_precision(function: Callable) -> Callable:
+    """Multiply the matrices of a function in the precision of their type; GPUs round float32 to 10 bits by default."""
+
+    def called(*arguments: Any, **named: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            return function(*arguments, **named)
+
+    return functools.wraps(function)(called)
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Env:
     """`reset(key) -> obs, world` and `step(key, world, action) -> obs, world, reward, terminated, truncated, info`.
@@ -172,6 +182,7 @@ class Env:
         leaves = zip(jax.tree.leaves(self.params), self._drawn, strict=True)
         return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
+    @in_full_precision
     def reset(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Obs, World]:
         """First observation and world; `progress` is that of training in [0, 1], for a task with a curriculum."""
         obs, world = self.begin(key, progress)
@@ -180,6 +191,7 @@ class Env:
         return observation(obs, world), world
 
     @checked
+    @in_full_precision
     def begin(self, key: Key, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
         """`reset` without images."""
         world = self.compiled(episode.start)(key, progress)
@@ -194,6 +206,7 @@ class Env:
         return (look if self.vision.on_host else self._program(method, look))(noise, world, *args)
 
     @checked
+    @in_full_precision
     def step(
         self, key: Key, world: World, action: Float[ArrayLike, "n a"]
     ) -> tuple[Obs, World, Float[Array, " n"], Array, Array, dict[str, Any]]:

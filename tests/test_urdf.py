@@ -60,7 +60,7 @@ def test_rotors_are_where_gym_pybullet_drones_has_them(name):
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
-def test_neighbouring_rotors_turn_opposite_ways(vehicle):
+def test_neighboring_rotors_turn_opposite_ways(vehicle):
     params = jaxdrones.load_params(vehicle)
     around = np.argsort(np.arctan2(*np.asarray(params.rotor_pos)[:, :2].T))
     spin = np.asarray(params.rotor_spin)[around]

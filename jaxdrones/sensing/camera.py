@@ -23,7 +23,7 @@ _POSITIVE = number(name="{argument} of a camera", above=0)
 @checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Pinhole camera on every drone of a team, fixed to the body unless `levelled`.
+    """Pinhole camera on every drone of a team, fixed to the body unless `leveled`.
 
     The camera's x axis is the viewing direction; y points left and z up in the image, as in the body frame.
     """
@@ -37,11 +37,11 @@ class Camera:
     principal_point: tuple[float, float] = (0.0, 0.0)
     """Principal point, pixels to the right of and below the image center."""
     offset: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
-    """(3,) position of the eye relative to the center of mass, m, body axes; world axes if the camera is levelled.
+    """(3,) position of the eye relative to the center of mass, m, body axes; world axes if the camera is leveled.
     `None`: one arm of the drone above the center of mass."""
     orientation: Annotated[tuple[float, ...], quaternion("{argument} of a camera")] = (0.0, 0.0, 0.0, 1.0)
     """(4,) unit quaternion (x, y, z, w), camera to body."""
-    levelled: bool = False
+    leveled: bool = False
     """Whether the camera points along the body's x axis with the world's z axis up in the image, whatever the roll."""
     near: Annotated[float | None, _POSITIVE] = 0.05
     """Smallest visible depth, m. `None`: the arm of the drone."""
@@ -85,12 +85,12 @@ class Camera:
 
         Returns:
             Position of the eye (3,), m, world; and the forward, left and up directions of the image as rows of a
-            (3, 3) matrix, world. The directions of a levelled camera are undefined where the body's x axis is vertical.
+            (3, 3) matrix, world. The directions of a leveled camera are undefined where the body's x axis is vertical.
         """
         arm = along_z(params.arm)
         offset = arm if self.offset is None else jnp.asarray(self.offset, arm.dtype)
         body = rotation.axes(state.quat)
-        if self.levelled:
+        if self.leveled:
             left = unit(cross(along_z(jnp.ones_like(params.arm)), body[0]))
             body = [body[0], left, cross(body[0], left)]
         else:
@@ -159,7 +159,7 @@ class DepthNoise:
         return jnp.where(steps > 0, jnp.minimum(1 / (jnp.maximum(steps, 1) * self.disparity_step), far), far)
 
 
-camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), offset=None, near=None)
+camera_2021 = Camera(leveled=True, aspect=1.0, principal_point=(0.5, -0.5), offset=None, near=None)
 """The camera of gym-pybullet-drones (2021), whose pixels are not square. Its renderer samples the lower left
 corners of the pixels in place of their centers."""
 

@@ -133,8 +133,8 @@ def test_mistakes_are_named(env_of):
         VectorEnv(short(env_of), 3, autoreset_mode="Never")
     with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'; did you mean 'height'"):
         gymnasium.make("jaxdrones/Hover-v0", heigth=1.0)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'colour'"):
-        gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=2, colour="red")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'color'"):
+        gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=2, color="red")
     with pytest.raises(ValueError, match="num_envs is 0"):
         VectorEnv("hover", 0)
     with pytest.raises(ValueError, match="unknown render_mode 'human'"):

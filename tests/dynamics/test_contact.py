@@ -22,7 +22,7 @@ make_step = lru_cache(partial(jaxdrones.make_step, effects=(ground_contact,), pa
 
 
 def foot(params) -> float:
-    """Height of the centre of mass of a level drone whose lowest point touches the ground, m."""
+    """Height of the center of mass of a level drone whose lowest point touches the ground, m."""
     return float(params.collision_height / 2 - params.collision_offset)
 
 
@@ -304,7 +304,7 @@ def in_one_place(n, quat=(0.0, 0, 0, 1), pos=(0.3, -0.2, 1.0)):
 
 
 def smallest_gap(state):
-    """Between the centres of any two drones, m."""
+    """Between the centers of any two drones, m."""
     pos = np.asarray(state.pos)
     return min(np.linalg.norm(a - b) for i, a in enumerate(pos) for b in pos[:i])
 

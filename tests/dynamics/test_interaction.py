@@ -17,7 +17,7 @@ from jaxdrones.dynamics import interaction
 
 PAGE = (Path(__file__).parents[2] / "docs" / "physics.md").read_text()
 params = jaxdrones.load_params("cf2x")
-LENGTH = float(np.sqrt(2) * params.arm)  # m, distance of neighbouring motors
+LENGTH = float(np.sqrt(2) * params.arm)  # m, distance of neighboring motors
 INDUCED = float(np.sqrt(params.weight / (8 * params.air_density * np.pi * params.prop_radius**2)))  # m/s, in hover
 
 
@@ -34,7 +34,7 @@ def on_lower(upper, lower=lower, params=params, other=params, pair=downwash):
     return pair(params, lower, other, upper)
 
 
-probe = params.replace(rotor_pos=jnp.zeros((4, 3)))  # all rotors in the centre of the drone
+probe = params.replace(rotor_pos=jnp.zeros((4, 3)))  # all rotors in the center of the drone
 
 
 @pytest.mark.parametrize("name", golden_data.names("downwash_on_0", variant="main"))
@@ -101,8 +101,8 @@ def test_half_a_metre_below_another_a_crazyflie_loses_the_share_of_its_weight_th
 
 def test_at_the_half_width_the_jet_blows_half_as_fast():
     width = 0.07668 * (1.0 / LENGTH + 5.817) * LENGTH
-    centre, side = (on_lower(hovering((x, 0, 1.0)), params=probe).force[2] for x in (0, width))
-    np.testing.assert_allclose(side / centre, 0.5, rtol=1e-12)
+    center, side = (on_lower(hovering((x, 0, 1.0)), params=probe).force[2] for x in (0, width))
+    np.testing.assert_allclose(side / center, 0.5, rtol=1e-12)
 
 
 @pytest.mark.parametrize("pair", [downwash, downwash_2021])

@@ -111,12 +111,12 @@ def test_a_drone_sees_itself_only_if_asked():
 
 
 @pytest.mark.slow
-def test_a_levelled_camera_ignores_roll_and_a_fixed_one_turns():
+def test_a_leveled_camera_ignores_roll_and_a_fixed_one_turns():
     scene, level, rolled = scattered(0), team(([-5, 0, 1.5], [0, 0, 0])), team(([-5, 0, 1.5], [0.5, 0, 0]))
-    for levelled in True, False:
-        camera = Camera(resolution=(16, 12), levelled=levelled)
+    for leveled in True, False:
+        camera = Camera(resolution=(16, 12), leveled=leveled)
         same = jnp.allclose(render(scene, *level, camera).depth, render(scene, *rolled, camera).depth)
-        assert same == levelled
+        assert same == leveled
 
 
 @pytest.mark.slow

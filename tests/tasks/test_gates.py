@@ -112,8 +112,8 @@ def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_a
     off = np.abs((np.asarray(drawn(2)["gates"]) - GATES + np.pi) % (2 * np.pi) - np.pi)  # headings are a circle
     assert np.all(off <= [0.15, 0.15, 0.1, 0.2]) and np.all(off.max((0, 1)) > [0.14, 0.14, 0.09, 0.19])
     assert np.max(np.abs(np.asarray(drawn(2)["poles"]) - POLES)) <= 0.15
-    centres = np.asarray(drawn(3)["gates"])[..., :3]
-    apart = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 10 * np.eye(4)
+    centers = np.asarray(drawn(3)["gates"])[..., :3]
+    apart = np.linalg.norm(centers[:, :, None] - centers[:, None], axis=-1) + 10 * np.eye(4)
     assert apart.min() > OPENING + 2 * FRAME
 
 

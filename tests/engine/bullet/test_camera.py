@@ -27,7 +27,7 @@ def pictures(step, state, camera=camera_2021, scene=None):
 
 
 @pytest.mark.slow
-def test_a_coloured_box_in_front_is_seen_where_geometry_says():
+def test_a_colored_box_in_front_is_seen_where_geometry_says():
     box = Box(pos=(2.0, 0.3, 1.0397), size=(0.4, 0.4, 0.4), color=(1.0, 0.0, 0.0, 1.0))
     with bullet.make_step(scene=Scene.of(box)) as step:
         rgb, depth, segmentation = pictures(step, at([0, 0, 1.0397]), Camera())
@@ -143,9 +143,9 @@ def test_what_is_no_camera_is_refused():
         camera_2021,
         Camera(),
         Camera(offset=(0.05, -0.02, 0.1), orientation=(0, np.sin(0.2), 0, np.cos(0.2)), principal_point=(3.0, -2.0)),
-        Camera(levelled=True, field_of_view=90.0, resolution=(48, 48), offset=(0, 0, 0.2), far=5.0),
+        Camera(leveled=True, field_of_view=90.0, resolution=(48, 48), offset=(0, 0, 0.2), far=5.0),
     ],
-    ids=["2021", "body", "mounted", "levelled"],
+    ids=["2021", "body", "mounted", "leveled"],
 )
 def test_bullet_sees_what_the_explicit_renderer_sees(camera):
     scene = Scene.of(

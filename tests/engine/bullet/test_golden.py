@@ -154,7 +154,7 @@ def test_a_fall_ends_at_the_recorded_height_and_gains_no_energy(name):
 def test_drones_that_meet_rebound_by_no_more_than_a_third_of_their_speed(name):
     """The law of the recorded flights too, wherever on their rims drones meet; ours by no more than a fifth.
 
-    Off-centre, drones turn about the point of contact. Later the thrust of the rotors, which are held at hover, drives
+    Off-center, drones turn about the point of contact. Later the thrust of the rotors, which are held at hover, drives
     them apart faster than they met, so that only the time of the first contact counts; see `rebound`.
     """
     case = golden_data.load(name)

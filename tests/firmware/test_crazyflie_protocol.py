@@ -147,7 +147,8 @@ def test_logged_angles_and_rates_are_degrees_and_accelerations_multiples_of_grav
 
 
 def make_commander():
-    return Commander(Parameters(firmware_pid.gains()), HighLevel())
+    parameters = Parameters(firmware_pid.gains())
+    return Commander(parameters, HighLevel(parameters.values))
 
 
 def generic(kind, *values, form="ffff"):
@@ -244,6 +245,14 @@ def test_invalid_set_points_are_ignored(data):
     assert commander.target(0.0).setpoint.thrust_given
 
 
+@pytest.mark.parametrize("angle", [math.nan, math.inf])
+def test_angles_that_are_not_finite_are_ignored(angle):
+    commander = make_commander()
+    before = [rpyt(commander), rpyt(commander, roll=5, thrust=30000)][-1]
+    for name in ("roll", "pitch", "yaw"):
+        assert rpyt(commander, thrust=40000, **{name: angle}) is before
+
+
 def plan(commander, kind, form, *values, t=0.0):
     return commander.plan(struct.pack("<BB" + form, kind, 0, *values), t, dataclasses.replace(SAMPLE, pos=np.zeros(3)))
 
@@ -267,6 +276,16 @@ def test_after_a_landing_the_motors_stop():
     plan(commander, 8, "ff?f", 0.0, 0.0, False, 2.0, t=3.0)
     assert not commander.target(4.9).setpoint.thrust_given
     assert commander.target(5.1).setpoint.thrust_given
+
+
+def test_a_take_off_or_landing_without_a_velocity_has_that_of_the_parameters():
+    commander = make_commander()
+    plan(commander, 9, "f?f?f", 1.0, False, 0.0, True, 0.0)
+    assert commander.high_level.trajectory.duration == pytest.approx(1 / 0.5)
+    set_by_name = b"\0hlCommander\0vland\0" + struct.pack("<Bf", TYPES["float"].parameter, 0.25)
+    commander._parameters.answer(3, set_by_name)
+    plan(commander, 10, "f?f?f", 0.0, False, 0.0, True, 0.0, t=3.0)
+    assert commander.high_level.trajectory.duration == pytest.approx(1 / 0.25)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,10 @@ _FORMATS = {  # type -> format of its data
 
 
 class Commander:
-    """Source of the set-point: the packets of a client, or the high-level commander after a handover."""
+    """Source of the set-point: the packets of a client, or the high-level commander after a handover.
+
+    Packets with numbers that are not finite are ignored.
+    """
 
     def __init__(self, parameters: Parameters, high_level: HighLevel):
         self._parameters, self.high_level = parameters, high_level
@@ -45,6 +48,8 @@ class Commander:
         if len(data) != 14:
             return
         roll, pitch, yaw, thrust = struct.unpack("<fffH", data)
+        if not all(map(math.isfinite, (roll, pitch, yaw))):
+            return
         if self._streamed is None:
             self._thrust_locked = True
         if thrust == 0:

@@ -45,7 +45,7 @@ class Crazyflie:
         self.rows = 0
         """Number of simulated periods of 10 ms."""
         self.parameters = Parameters(vehicle.gains, self._set_gains)
-        self.high_level = HighLevel()
+        self.high_level = HighLevel(self.parameters.values)
         self.commander = Commander(self.parameters, self.high_level)
         self.supervisor = Supervisor()
         self.target: Target = motors_off()

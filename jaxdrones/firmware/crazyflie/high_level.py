@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ _FORMATS: dict[int, tuple[str, str, dict[int, float]]] = {  # command -> name, f
 class HighLevel:
     """Planner of trajectories."""
 
+    parameters: Mapping[str, float]
+    """Values of the parameters of the vehicle."""
     memory: bytearray = dataclasses.field(default_factory=lambda: bytearray(MEMORY_BYTES))
     """Memory of trajectories."""
     trajectory: Trajectory | None = None
@@ -102,6 +105,8 @@ class HighLevel:
                 name = name.removesuffix("_with_velocity")
                 height = start.pos[2] + (height if name == "takeoff" else -height) if relative else height
                 way = abs(height - start.pos[2])
+                if velocity <= 0:  # the default, as in the firmware
+                    velocity = self.parameters["hlCommander.vtoff" if name == "takeoff" else "hlCommander.vland"]
                 return self._execute(name, t, start, height, yaw, keep_yaw, way / velocity if velocity > 0 else 0.0)
         return 0
 

@@ -34,6 +34,7 @@ _MEANINGS = {
     "target_pos": "commanded position, m, world",
     "target_vel": "commanded velocity, m/s, world",
     "target_yaw": "commanded heading, rad",
+    "load_pos": "position of the load on the cable of each drone, m, world",
 }
 _MAX_STRETCH = 0.05  # largest deviation of the length of a quaternion from 1
 _IMAGES = "images/"  # prefix of the names of their arrays
@@ -153,8 +154,13 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:  # spreadsheets write a mark of the byte order
             reader = csv.DictReader(lines)
-            table: dict[str, list[str]] = {name: [] for name in reader.fieldnames or ()}
+            names = reader.fieldnames or ()
+            table: dict[str, list[str]] = {name: [] for name in names}
+            if len(table) < len(names):
+                raise UserError("two columns have the same name")
             for row in reader:
+                if None in row or None in row.values():
+                    raise UserError(f"line {reader.line_num} has not {len(names)} entries, one for each column")
                 for name, entries in table.items():
                     entries.append(row[name])
         drones = table.pop("drone", ["drone 0"])

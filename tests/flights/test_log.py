@@ -54,6 +54,7 @@ def test_a_log_is_read_as_it_was_written(columns, tmp_path):
             lambda c: c.update(pos=c["pos"][:, :2]),
             r"pos is float64 of shape \(300, 2\); give numbers of shape \(300, 1, 3\)",
         ),
+        (lambda c: c.update(load_pos=c["pos"][:, :2]), r"load_pos is .*give numbers .*position of the load"),
     ],
 )
 def test_what_no_flight_has_is_named(columns, tmp_path, change, says):
@@ -119,6 +120,21 @@ def test_a_table_that_mixes_drones_or_times_is_refused(columns, tmp_path):
             read_log(tmp_path / f"{name}.csv")
     (tmp_path / "marked.csv").write_text("\n".join([head, *rows]), encoding="utf-8-sig")  # as spreadsheets write it
     assert read_log(tmp_path / "marked.csv").labels == ("a", "b")
+
+
+def test_a_table_whose_lines_or_columns_do_not_fit_is_refused(columns, tmp_path):
+    """A line that was cut off has no NaN at its end, and one with decimal commas is not read shifted."""
+    save_csv(written(tmp_path, columns), tmp_path / "flight.csv")
+    head, *rows = (tmp_path / "flight.csv").read_text().splitlines()
+    tables = {
+        "cut": [head, *rows[:-1], rows[-1].rpartition(",")[0]],
+        "commas": [head, *rows[:4], rows[4].replace(".", ","), *rows[5:]],
+        "twice": [head + ",pos_x", *(row + ",7" for row in rows)],
+    }
+    for name, lines in tables.items():
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        with pytest.raises(ValueError, match="two columns" if name == "twice" else "has not .* entries"):
+            read_log(tmp_path / f"{name}.csv")
 
 
 def test_a_name_of_a_single_drone_is_its_label(columns, tmp_path):

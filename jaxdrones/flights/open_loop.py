@@ -179,7 +179,11 @@ def _rotor_speed(
 
 
 def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]:
-    """Rows of x with a delay in rows, linearly interpolated, without its first and last `_MAX_DELAY` rows."""
+    """Rows of x with a delay in rows, linearly interpolated, without its first and last `_MAX_DELAY` rows.
+
+    The delay is limited to `_MAX_DELAY` rows.
+    """
+    delay = jnp.clip(delay, -_MAX_DELAY, _MAX_DELAY)
     n = len(x) - 2 * _MAX_DELAY
     shifts = range(-_MAX_DELAY, _MAX_DELAY + 1)
     weights = [jnp.maximum(1 - jnp.abs(delay - shift), 0) for shift in shifts]

@@ -20,7 +20,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
 from jaxdrones.flights.fit import _estimate
 from jaxdrones.flights.least_squares import standard_errors
-from jaxdrones.flights.open_loop import residuals
+from jaxdrones.flights.open_loop import _shifted, residuals
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
 from jaxdrones.urdf import parse_params
@@ -78,6 +78,12 @@ def fits(flown):
         fit(logs, start, ("kf",), validate).parameters["kf"]
         for logs, validate in (([log], ()), ([log, log], ()), ([log], [other]))
     ]
+
+
+@pytest.mark.parametrize("delay", [-7.0, -0.5, 0.0, 5.8, 6.5, 20.0])
+def test_constant_rotor_speeds_have_no_delay(delay):
+    """Beyond the six rows of margin the delay is limited: the rotors do not slow down or stop."""
+    np.testing.assert_allclose(_shifted(jnp.full((40, 4), 2e4), jnp.array(delay)), 2e4, rtol=1e-6)
 
 
 def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):

@@ -36,6 +36,12 @@ def test_the_ground_carries_what_thrust_does_not(thrust):
     np.testing.assert_array_equal(forces[:, 1], 0)  # in the air
 
 
+def test_the_ground_carries_more_in_thin_air():
+    log = log_at([REST, 1.0], thrust=0.6)
+    thin = contact_forces(dataclasses.replace(log, params=PARAMS.replace(air_density=0.5 * PARAMS.air_density)))
+    np.testing.assert_allclose(thin[:, 0, 2], (1 - 0.5 * 0.6) * WEIGHT, rtol=1e-3)
+
+
 def test_the_force_of_contact_accelerates_the_drone():
     forces = contact_forces(log_at([REST, REST], 1.0, speed=(-5.0, 0.0)))
     np.testing.assert_allclose(forces[:, 0], np.broadcast_to([-5.0 * PARAMS.mass[0], 0, 0], (5, 3)), atol=1e-3 * WEIGHT)

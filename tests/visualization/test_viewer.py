@@ -62,6 +62,18 @@ def test_positions_in_the_page_equal_the_record_to_a_tenth_of_a_millimetre(recor
     same(header(show(record))["worlds"][0], record)
 
 
+def test_a_log_by_the_time_of_the_day_begins_at_zero(record):
+    """Float32 has steps of 128 s at the seconds since 1970."""
+    late = dataclasses.replace(record, t=record.t + 1.7e9)
+    np.testing.assert_allclose(header(show(late))["worlds"][0]["t"], record.t - record.t[0], atol=1e-6)
+
+
+def test_the_thrust_in_the_page_is_that_in_the_air_of_the_flight(record):
+    thin = dataclasses.replace(record, params=record.params.replace(air_density=0.5 * record.params.air_density))
+    kf, in_thin_air = (header(show(x))["vehicles"][0]["kf"] for x in (record, thin))
+    assert in_thin_air == pytest.approx(0.5 * kf)
+
+
 @pytest.mark.parametrize("extent", [1e-3, 1.0, 6.0, 7.0, 400.0])
 def test_positions_are_as_exact_in_small_and_large_flights(team, extent):
     path = trajectory(team)

@@ -35,7 +35,9 @@ def contact_forces(log: FlightLog) -> np.ndarray | None:
     row, drone = np.nonzero((log.pos[..., 2] < reach) | scene.has_obstacles | team)
     if not len(row):
         return None
-    mass, weight, kf = (np.asarray(x, float)[drone] for x in (log.params.mass, log.params.weight, log.params.kf))
+    params = log.params
+    in_air = params.kf * params.relative_density
+    mass, weight, kf = (np.asarray(x, float)[drone] for x in (params.mass, params.weight, in_air))
     x, y, z = (np.asarray(axis, float) for axis in _axes(np.asarray(log.quat[row, drone])))
     with np.errstate(invalid="ignore", over="ignore"):
         acceleration = np.gradient(np.asarray(log.vel, float), log.t, axis=0)[row, drone]

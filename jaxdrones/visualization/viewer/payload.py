@@ -90,7 +90,8 @@ def encode(
     worlds = []
     for record, name in zip(records, names, strict=True):
         world: dict[str, Any] = {"name": name, "labels": list(record.labels)} | _rows(arrays, record)
-        constants = {name: np.asarray(getattr(record.params, name), float).tolist() for name in _CONSTANTS}
+        params = record.params.replace(kf=record.params.kf * record.params.relative_density)  # thrust in this air
+        constants = {name: np.asarray(getattr(params, name), float).tolist() for name in _CONSTANTS}
         drones = [{name: values[i] for name, values in constants.items()} for i in range(len(record.labels))]
         world["vehicle"] = [_index(vehicles, drone) for drone in drones]
         world["images"] = [

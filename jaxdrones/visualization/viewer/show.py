@@ -81,10 +81,23 @@ def show(
             f"arrows have shape {np.shape(arrows)} beside {len(records)} worlds, the first of shape "
             f"{records[0].pos.shape}; give one world, and as many vectors as positions"
         )
+    records = [_from_start(record) for record in records]
     arrows = None if arrows is None else np.nan_to_num(np.asarray(arrows, float))
     title = str(records[0].conditions) if title is None else title
     payload = encode(records, list(worlds), title, arrows, layout=LAYOUTS[others])
     return Page(title, payload, height)
+
+
+def _from_start(record: FlightLog) -> FlightLog:
+    """Log with times from its first row, if it begins later than it lasts and after 1 s, as by the time of the day.
+
+    A page begins at 0 s and has times in float32.
+    """
+    begin = record.t[0]
+    if begin <= max(record.t[-1] - begin, 1.0):
+        return record
+    images = {name: ImageSequence(x.t - begin, x.frames) for name, x in record.images.items()}
+    return dataclasses.replace(record, t=record.t - begin, images=images)
 
 
 def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:

@@ -4,6 +4,8 @@ Every function is for one rotation: use `jax.vmap` for batches. All are differen
 at zero rotation.
 """
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -144,3 +146,8 @@ def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
     cos_yaw = jnp.where(pole, y * y - x * x, w * w + x * x - y * y - z * z)
     pitch = atan2(2 * (w * y - x * z), cos_pitch)
     return jnp.stack([atan2(sin_roll, cos_roll), pitch, atan2(sin_yaw, cos_yaw)])
+
+
+def yaw_of(x: float, y: float, z: float, w: float) -> float:
+    """Yaw of one unit quaternion of Python numbers, rad, without JAX."""
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

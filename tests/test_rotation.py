@@ -207,3 +207,8 @@ def test_roll_pitch_yaw_are_continuous_where_the_pole_begins():
     again = each(rotation.from_rpy, each(rotation.to_rpy, quat))
     # Inside the band pitch becomes 90 degrees: off by acos(0.99999) = 0.0045 rad, half of it in the quaternion.
     assert np.all(np.abs(np.sum(quat * again, axis=1)) >= np.cos(0.0045 / 2) - 1e-9)
+
+
+def test_the_yaw_of_python_numbers_is_that_of_an_array():
+    for q in jax.vmap(rotation.normalize)(jax.random.normal(jax.random.key(3), (100, 4))):
+        assert rotation.yaw_of(*q.tolist()) == pytest.approx(float(rotation.to_rpy(q)[2]), abs=1e-9)

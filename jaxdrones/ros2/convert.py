@@ -14,6 +14,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
 from jaxdrones.ros2.command import Command, Mode
+from jaxdrones.rotation import yaw_of
 from jaxdrones.sensing import Camera
 
 _NS = 1_000_000_000
@@ -155,7 +156,7 @@ def to_command(name: str, message: Any) -> Command:
         length = math.hypot(x, y, z, w)
         if not abs(length - 1) < 1e-3:
             raise Refused("orientation", f"has length {length:g}", "give a unit quaternion (x, y, z, w)")
-        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        yaw = yaw_of(x, y, z, w)
         return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
     linear, angular = _finite(numbers(message.linear), "linear"), _finite(numbers(message.angular), "angular")
     if name == "cmd_vel":

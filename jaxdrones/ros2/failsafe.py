@@ -10,6 +10,7 @@ import numpy as np
 from jaxdrones.arguments import Seconds, checked, choice
 from jaxdrones.params import Params
 from jaxdrones.ros2.command import Command, Mode
+from jaxdrones.rotation import yaw_of
 from jaxdrones.state import State
 
 ACTIONS = ("hover", "land", "stop")
@@ -67,8 +68,7 @@ def hover(command: Command, state: State, i: int) -> Command:
     """Command to hold the last commanded position, or after other commands the present one of drone `i`."""
     if command.mode == Mode.POSITION:
         return command
-    x, y, z, w = np.asarray(state.quat[i]).tolist()
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    yaw = yaw_of(*np.asarray(state.quat[i]).tolist())
     return Command.zero(Mode.POSITION, pos=np.asarray(state.pos[i]), yaw=yaw)
 
 

@@ -10,6 +10,7 @@ from jaxdrones.firmware.crazyflie.high_level import HighLevel
 from jaxdrones.firmware.crazyflie.parameters import Parameters
 from jaxdrones.firmware.crazyflie.planner import Goal
 from jaxdrones.firmware.crazyflie.vehicle import Sample, Target, motors_off, target
+from jaxdrones.rotation import yaw_of
 
 LEVEL_AFTER, OFF_AFTER = 0.5, 2.0
 """Seconds without a set-point after which the vehicle levels, and after which its motors stop."""
@@ -130,8 +131,7 @@ def _decode(kind: int, values: tuple[Any, ...]) -> Target:
         yaw_rate = math.radians(yaw_rate if kind == 10 else -yaw_rate)
         return target(vel=[forward, left, 0], in_heading=True, height=height, yaw_rate=yaw_rate)
     if kind == 6:
-        x, y, z, w = decompress(values[9])
-        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        yaw = yaw_of(*decompress(values[9]).tolist())
         return target(np.array(values[:3]) / 1000, np.array(values[3:6]) / 1000, yaw=yaw)
     if kind == 7:
         *pos, degrees = values

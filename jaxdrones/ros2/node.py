@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Hashable
 from typing import Any
 
+from jaxdrones.errors import UserError
 from jaxdrones.ros2 import convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.bag import Recorder
@@ -71,7 +72,15 @@ class Node:
             recorder: recorder of all messages.
             warn: function of a line of text for warnings.
             clock: time, s.
+
+        Raises:
+            UserError: a camera with more images than control steps.
         """
+        if camera is not None and camera.rate is not None and camera.rate > simulation.control_hz:
+            raise UserError(
+                f"the rate of the camera is {camera.rate:g} images/s; give at most the control rate, "
+                f"{simulation.control_hz}"
+            )
         self._flight, self._transport, self._lockstep = simulation, transport, lockstep
         self._failsafe = failsafe or Failsafe()
         self._speed, self._camera, self._recorder = speed, camera, recorder
@@ -214,7 +223,7 @@ class Node:
                     self._send(topics.output(i, name), message)
 
     def _image_is_due(self, camera: Camera) -> bool:
-        if camera.rate is None or camera.rate >= self._flight.control_hz:
+        if camera.rate is None:
             return True
         per_step, k = camera.rate / self._flight.control_hz, self._flight.steps
         return k == 0 or int(k * per_step + 1e-6) > int((k - 1) * per_step + 1e-6)

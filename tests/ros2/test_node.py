@@ -10,6 +10,7 @@ from helpers import assert_close
 from in_process import InProcess, Peer, Wire, positions
 from ros2_team import HZ, make_simulation, team_step
 
+from jaxdrones.errors import UserError
 from jaxdrones.ros2 import Failsafe, Node, PeerLost, convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.sensing import Camera
@@ -197,6 +198,11 @@ def test_images_come_at_the_rate_of_the_camera():
     stamps = [convert.nanoseconds(m.header.stamp) for m in wire.sent["drone_1/camera/image_raw"]]
     assert stamps == [k * 40_000_000 for k in range(6)]
     assert len(wire.sent["drone_1/camera/camera_info"]) == 6
+
+
+def test_more_images_than_control_steps_are_refused():
+    with pytest.raises(UserError, match="101 images/s; give at most the control rate, 100"):
+        make_node(Wire(), camera=Camera(resolution=(8, 6), rate=101.0))
 
 
 def test_a_slow_computer_is_counted_and_not_caught_up_with():

@@ -145,7 +145,8 @@ class _Training(base.Wrapper):
         done = terminated | truncated
 
         now = {"sum_reward": after.reward, "length": jnp.ones_like(steps), **after.metrics}
-        sums = {name: again * total + now[name] for name, total in info["episode_metrics"].items()}
+        before = jax.tree.map(lambda x: jnp.where(again > 0, x, 0), info["episode_metrics"])  # 0 * NaN would stay NaN
+        sums = {name: total + now[name] for name, total in before.items()}
         info = after.info | {
             "steps": steps,
             "truncation": _float(truncated),

@@ -127,6 +127,10 @@ def test_episode_metrics_are_sums_over_the_episode(env_of):
     metrics = state.info["episode_metrics"]
     np.testing.assert_allclose(metrics["sum_reward"], rewards[4] + rewards[5], rtol=1e-5)
     np.testing.assert_array_equal(metrics["length"], 2)
+    diverged = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), metrics)
+    ended = state.replace(done=jnp.ones(2, jnp.float32), info=state.info | {"episode_metrics": diverged})
+    after = step(ended, jnp.zeros((2, 4)))  # the NaN of one episode is not in the next one
+    np.testing.assert_allclose(after.info["episode_metrics"]["sum_reward"], after.reward, rtol=1e-5)
 
 
 @pytest.mark.slow

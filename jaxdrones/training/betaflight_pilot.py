@@ -13,6 +13,7 @@ from jaxdrones.envs import Env
 from jaxdrones.envs.observations import observe
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import Sticks, sticks_for
+from jaxdrones.firmware.betaflight.pilots import PERIOD
 from jaxdrones.firmware.drone import Sample
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.tasks.task import World
@@ -34,6 +35,11 @@ class PolicyPilot:
             )
         if env.vision is not None or env.sensors or env.drones != 1:
             raise UserError(f"the policy is for {env}; give one of a single drone without cameras and sensors")
+        if env.dt < PERIOD - 1e-9:
+            raise UserError(
+                f"the policy acts at {1 / env.dt:g} Hz, and sticks move at {1 / PERIOD:g} Hz; train one with "
+                f"--set control_hz={1 / PERIOD:g} or less"
+            )
         self._env, self._params = env, jax.tree.map(lambda x: x[0], env.params)
         self._entries = env.action.entries(self._params)
         world = env.reset(jax.random.key(seed))[1]

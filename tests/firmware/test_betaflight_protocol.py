@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from jaxdrones import load_params
+from jaxdrones.envs import make
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import Simulation, Sticks, msp, settings, sticks_for
 from jaxdrones.firmware.betaflight.packets import motor_order, motor_outputs, rc_packet, state_packet
+from jaxdrones.training.betaflight_pilot import PolicyPilot
 
 LEVEL = np.array([0.0, 0, 0, 1])
 
@@ -165,3 +167,10 @@ def test_a_status_of_another_version_is_a_lack_of_an_answer(data):
 def test_switches_act_above_1700_us():
     slot, mode, channel, first, last = settings.mode_range(1, 1, 1)
     assert (slot, mode, channel, 900 + 25 * first, 900 + 25 * last) == (1, 1, 1, 1700, 2100)
+
+
+def test_a_policy_faster_than_the_sticks_is_refused():
+    """At 200 Hz it would act at every second of its steps, and its moving target would fly at half of its speed."""
+    env = make("hover", vehicle="racer", action="thrust_and_rates", control_hz=200)
+    with pytest.raises(UserError, match="the policy acts at 200 Hz, and sticks move at 100 Hz"):
+        PolicyPilot(env, lambda obs: obs)

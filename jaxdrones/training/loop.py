@@ -114,6 +114,7 @@ class _Loop:
             self.id, self.seconds, self.reached = about["run_id"], about["seconds"], about["reached"]
             self.best, self.highest_success = (best[0], best[1]), max(best[0], about["highest_success"])
             self.last_evaluation_seconds = about["evaluation_seconds"]
+            self.evaluation_seconds = about.get("evaluating", 0.0)
         else:
             self.id, self.state = secrets.token_hex(8), trainer.start(self.key)
             results = self.evaluate(self.state.policy, 0)
@@ -205,6 +206,7 @@ class _Loop:
         self.run.save_policy("last", state.policy, **about)
         progress = {"seconds": self.seconds, "evaluation_seconds": self.last_evaluation_seconds}
         progress |= {"highest_success": self.highest_success, "reached": self.reached}
+        progress |= {"evaluating": self.evaluation_seconds}
         self.run.save_state(state, **about, **progress)
 
     def finish(self) -> None:

@@ -65,9 +65,11 @@ def test_a_training_that_is_killed_twice_has_the_numbers_of_one_that_was_not(tra
         assert run.started and not run.finished
         with (tmp_path / "progress.csv").open("a") as file:
             file.write("1,2")  # the first bytes of a row that was being written
+    before = run.sidecar("state")["evaluating"]
     loop.train(trainer, run, 3, lambda *_: None)
     assert numbers(run) == numbers(whole)
     assert [row["update"] for row in run.history()] == [0, 1, 2, 3, 4, 5, 6]
+    assert run.report()["seconds"]["evaluating"] > before > 0
 
 
 def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole, tmp_path, monkeypatch):

@@ -274,14 +274,15 @@ def _sliding_mass(params: Params) -> Float[Array, ""]:
     """Effective mass of a point of the rim under a sideways force, with the drone free to slide, tilt and turn, kg."""
     radius, ring = rim(params)
     low = jnp.abs(params.collision_offset) + radius
-    ix, _, iz = components(params.inertia)
-    return 1 / (1 / params.mass + low**2 / ix + ring**2 / iz)
+    ix, iy, iz = components(params.inertia)
+    return 1 / (1 / params.mass + low**2 / jnp.minimum(ix, iy) + ring**2 / iz)
 
 
 def _tilting_mass(params: Params) -> Float[Array, ""]:
     """Effective mass of a sphere under a force along the thrust axis, times a constant; at most the mass, kg."""
-    ix, _, _ = components(params.inertia)
-    return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + rim(params)[1] ** 2 / ix))
+    ix, iy, _ = components(params.inertia)
+    tilting = rim(params)[1] ** 2 / jnp.minimum(ix, iy)
+    return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + tilting))
 
 
 def _series_mass(a: Array, b: Array) -> Array:

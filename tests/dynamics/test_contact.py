@@ -10,6 +10,7 @@ from helpers import assert_finite, jit_unoptimized, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation, vector
+from jaxdrones.dynamics.contact import _sliding_mass, _tilting_mass
 from jaxdrones.engine import bullet
 from jaxdrones.engine.physics import Physics
 from jaxdrones.sensing import Scene
@@ -435,3 +436,11 @@ def test_the_gradient_of_a_landing_is_unbiased_and_no_noisier_than_one_of_order_
     for estimate in first, zeroth:
         assert abs(estimate.mean() - truth.mean()) < 3 * estimate.std() / np.sqrt(n)
     assert first.std() < 1.5 * zeroth.std() and first.std() < 1.2
+
+
+@pytest.mark.parametrize("mass", [_sliding_mass, _tilting_mass])
+def test_the_mass_at_the_rim_is_that_about_the_easier_axis(mass):
+    long = CRAZYFLIE.replace(inertia=CRAZYFLIE.inertia * jnp.array([3.0, 1.0, 1.0]))
+    wide = CRAZYFLIE.replace(inertia=CRAZYFLIE.inertia * jnp.array([1.0, 3.0, 1.0]))
+    np.testing.assert_allclose(mass(long), mass(CRAZYFLIE), rtol=1e-2)  # 1.4e-5 and 1.4e-5 kg m^2 about x and y
+    np.testing.assert_allclose(mass(wide), mass(CRAZYFLIE), rtol=1e-2)

@@ -169,9 +169,9 @@ def track(gates: Annotated[ArrayLike, _POSES], opening: float = 0.4, frame: floa
 def gate(
     pos: Annotated[ArrayLike, _CENTER],
     yaw: ArrayLike = 0.0,
-    opening: float = 0.4,
-    frame: float = 0.16,
-    depth: float = 0.05,
+    opening: _LENGTH = 0.4,
+    frame: _LENGTH = 0.16,
+    depth: _LENGTH = 0.05,
 ) -> Box:
     """The four beams of a gate: a square opening in a square frame.
 

@@ -129,6 +129,8 @@ def test_a_track_is_its_gates_in_their_order():
         (lambda: room(size=(4, 4)), r"size of a room has shape \(2,\); expected \(3,\)"),
         (lambda: room(wall=np.inf), "wall of a room is inf; give a positive number"),
         (lambda: room(pillars=1.5, key=KEYS[0]), "pillars is 1.5; give a whole number"),
+        (lambda: gate((0, 0, 1), opening=-0.4), r"opening of a gate is -0.4; give a positive number \(m\)"),
+        (lambda: gate((0, 0, 1), frame=0), "frame of a gate is 0; give a positive number"),
         (lambda: track([(0, 0, 1)]), r"gates of a track has shape \(1, 3\); expected \(k, 4\)"),
     ],
 )

@@ -135,7 +135,7 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
         (lambda: Scene.of("box"), "'box' is not an obstacle"),
         (lambda: Scene.of((BALL, BALL)), "give each as its own argument"),
         (lambda: Scene.of(BALL, ground=3), "ground is 3; give True or False"),
-        (lambda: Scene.of(gate((0, 0, 1), opening=-1)), "size of Box is .*; give positive"),
+        (lambda: gate((0, 0, 1), opening=-1), "opening of a gate is -1; give a positive number"),
         (lambda: gate(np.zeros((2, 3))), r"pos of a gate has shape \(2, 3\).*jax\.vmap"),
     ],
 )

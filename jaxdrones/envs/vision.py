@@ -21,6 +21,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import IMAGES, World
 
 _PIXELS = 16384  # computed at a time, to fit in a cache
+_ROUNDING = 1e-4  # of an image; tolerance for rounding of the times of images
 _PIXELS_OF_STARTS = 2048  # the same for starts of episodes, which are few in a step
 
 
@@ -50,16 +51,22 @@ class Vision:
     """Function that renders the images of a team."""
     on_host: bool
     """Whether `render` runs outside of JAX, one image after the other."""
-    every: int
-    """Control steps between images."""
+    every: float
+    """Control steps between images; the k-th one is from the first step at or after k times as many."""
     delay: int
     """Control steps between the exposure and the observation of an image."""
 
     def __str__(self) -> str:
         width, height = self.camera.resolution
-        rate = f" every {self.every} steps" if self.every > 1 else ""
+        rate = f" every {self.every:g} steps" if self.every > 1 else ""
         late = f", {self.delay} steps late" if self.delay else ""
         return f"{' and '.join(self.images)} of {width} x {height} pixels{rate}{late}"
+
+    def is_due(self, step: Array) -> Array:
+        """Whether a new image is observed after a control step."""
+        exposed = step - self.delay
+        count, before = (jnp.floor((exposed - i) / self.every + _ROUNDING) for i in (0, 1))
+        return (count > before) & (exposed > 0)
 
     def look(self, params: Params, drones: State, scene: Scene) -> dict[str, Array]:
         """Images of a state, without noise."""
@@ -78,8 +85,7 @@ class Vision:
         if self.every == 1:
             images = self._exposed(key, world.params, poses[0], world.scene)
         else:
-            due = ((world.step - self.delay) % self.every == 0) & (world.step > self.delay)
-            images = self._where(due, _PIXELS, key, world, poses[0])
+            images = self._where(self.is_due(world.step), _PIXELS, key, world, poses[0])
         return world.replace(images=images, poses=poses[1:])
 
     def renewed(self, key: Any, world: World, ended: Array) -> World:
@@ -136,8 +142,9 @@ def make_vision(
 
     A Bullet step renders the images itself, and was built with the scene unless that is random.
     """
-    every = 1 if camera.rate is None else 1 / (camera.rate * dt)
-    if every < 1 - 1e-6:
+    every = 1.0 if camera.rate is None else 1 / (camera.rate * dt)
+    every = round(every) if abs(every - round(every)) < 1e-6 * every else every
+    if every < 1:
         raise UserError(
             f"the rate of the camera is {camera.rate:g} images/s; give at most the control rate, {1 / dt:g}, or a "
             "higher control_hz"
@@ -149,7 +156,7 @@ def make_vision(
             return step.camera(params, drones, camera, scene if drawn else None)
         return render(scene, params, drones, camera)
 
-    return Vision(tuple(images), camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
+    return Vision(tuple(images), camera, take, isinstance(step, HostStep), every, round(camera.latency / dt))
 
 
 def _pose(drones: State) -> Float[Array, "n 7"]:

@@ -50,7 +50,7 @@ class Camera:
     rate: Annotated[float | None, _POSITIVE] = None
     """Images per second. The default is one every control step."""
     latency: Annotated[float, number("s", "{argument} of a camera", at_least=0)] = 0.0
-    """Age of an image when it is observed for the first time, s."""
+    """Age of an image when it is observed for the first time, s; in environments rounded to control steps."""
     sees_self: bool = False
     """Whether the drone with the camera is visible."""
     noise: Any = None

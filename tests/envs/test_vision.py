@@ -70,6 +70,13 @@ def test_an_image_shows_the_state_of_its_time_until_the_next_one_comes(env):
     assert len(np.unique(np.asarray(expected), axis=0)) == len(at)
 
 
+def test_a_rate_that_does_not_divide_the_control_rate_is_kept():
+    """Of 30 images per second at 100 Hz, the k-th one is from the first step at or after k / 30 s."""
+    vision = sees(rate=30.0, latency=0.02).vision
+    seen = np.flatnonzero(vision.is_due(jnp.arange(1003)))
+    np.testing.assert_array_equal(seen - 2, np.ceil(100 * np.arange(1, 301) / 30 - 1e-9))
+
+
 @pytest.mark.slow  # its quick sibling is in test_exposures.py
 def test_the_gradient_of_a_held_image_is_that_of_the_state_that_it_shows(env):
     blind = make(TASK, vision=())

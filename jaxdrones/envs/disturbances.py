@@ -71,24 +71,23 @@ def random_pushes(
     force: Annotated[float, number("share of the weight", "force of a push", at_least=0)],
     interval: Annotated[float, number("s", above=0, infinite=True)] = 1.0,
     duration: Annotated[float, number("s", above=0, infinite=True)] = 0.1,
-) -> Disturbance:
+) -> DisturbanceWithMemory:
     """External forces of U(-force, force) (fraction of the weight) along each axis, at random times.
 
     One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
+    They are added to the external force at the start of the episode, which is in `params.aux["pushes"]`.
     """
 
-    def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
+    def advance(key: jax.Array, params: Params, dt: float) -> Params:
         n = len(params.mass)
         u = jax.random.uniform(key, (n, 4), params.external_force.dtype)
-        fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
+        constant = params.aux["pushes"]
+        fresh = constant + force * params.weight[:, None] * (2 * u[:, 1:] - 1)
         begins, ends = u[:, :1] < dt / interval, u[:, :1] > 1 - dt / duration
-        return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
+        return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, constant, params.external_force)))
 
-    return described(
-        f"pushes of U(-{force:g}, {force:g}) of the weight along each axis, every {interval:g} s for {duration:g} s on "
-        "average",
-        disturbance,
-    )
+    text = f"pushes of U(-{force:g}, {force:g}) of the weight along each axis, every {interval:g} s for {duration:g} s"
+    return DisturbanceWithMemory("pushes", lambda key, params: params.external_force, advance, f"{text} on average")
 
 
 @checked

@@ -129,7 +129,8 @@ def test_the_physics_says_what_was_asked_for():
     assert physics["effects"] == "drag, external_force" and physics["rotors"] == "lagging_rotors"
     assert physics["integrator"] == "rk4" and physics["delay"] == "0.02 s between action and command"
     assert physics["rates"] == "50 control steps per second of 4 physics steps of 5 ms"
-    assert physics["drawn per episode"] == "mass times U(0.9, 1.1)" and "0.005 m" in physics["noise"]
+    drawn = f"mass times U(0.9, 1.1); start of: {physics['disturbance']}"
+    assert physics["drawn per episode"] == drawn and "0.005 m" in physics["noise"]
     assert "0.3" in physics["disturbance"] and told.vehicle["name"] == "racer" and told.vehicle["mass"] == "0.83 kg"
 
 

@@ -137,7 +137,7 @@ def test_wind_blows_a_drone_with_drag_away():
 
 def test_pushes_come_as_often_and_last_as_long_as_asked():
     disturbance = random_pushes(0.5, interval=1.0, duration=0.1)
-    team = TEAM
+    team = jax.vmap(disturbance.start)(jax.random.split(KEY, len(TEAM.mass)), TEAM)
 
     def advance(team, key):
         team = disturbance(key, team, 0.01)
@@ -149,6 +149,18 @@ def test_pushes_come_as_often_and_last_as_long_as_asked():
     np.testing.assert_allclose(begins / (200 * 20.0), 1.0, rtol=0.15)
     np.testing.assert_allclose(active.mean(), 0.1, rtol=0.15)
     assert np.abs(push).max() <= 0.5 * float(team.weight[0])
+
+
+def test_pushes_are_added_to_the_force_at_the_start():
+    disturbance, force = random_pushes(0.5, interval=0.1, duration=0.05), jnp.array([0.05, 0.0, -0.01])
+    team = TEAM.replace(external_force=jnp.broadcast_to(force, TEAM.external_force.shape))
+    team = jax.vmap(disturbance.start)(jax.random.split(KEY, len(team.mass)), team)
+    found = []
+    for key in jax.random.split(KEY, 200):
+        team = disturbance(key, team, 0.01)
+        found.append(np.asarray(team.external_force - force[None]))
+    calm = np.all(np.array(found) == 0, axis=-1)
+    assert 0.3 < calm.mean() < 0.9 and not np.allclose(found, 0)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from jaxdrones.arguments import checked, sequence
 from jaxdrones.checks import bind, check_function, is_concrete, takes
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import layers, needs_of
+from jaxdrones.dynamics.propulsion import pwm_rotors
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
@@ -116,10 +117,15 @@ class Physics:
         text += f", models: {', '.join(model.name for model in self.models)}" if self.models else ""
         return text + (f", {self.neighbors}" if self.neighbors else "")
 
+    @property
+    def rotors_lag(self) -> bool:
+        """Whether the rotors have the lag of `lagging_rotors`, also as a part of `pwm_rotors`."""
+        return inspect.unwrap(self.rotors) in map(inspect.unwrap, (lagging_rotors, pwm_rotors))
+
     def check_lag(self, params: Params, dt: float) -> None:
         """Raise for rotors that lag by less than half a physics step (s): their speed would swing ever wider."""
         times = params.rotor_rise_time, params.rotor_fall_time
-        lags = inspect.unwrap(self.rotors) is inspect.unwrap(lagging_rotors) and all(map(is_concrete, times))
+        lags = self.rotors_lag and all(map(is_concrete, times))
         if lags and dt > (largest := 2 * min(float(np.asarray(time).min()) for time in times)):
             raise UserError(
                 f"the physics step is {dt:.4g} s and rotors that lag by {largest / 2:.2g} s are stable up to "

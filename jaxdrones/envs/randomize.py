@@ -19,6 +19,7 @@ from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks.task import Randomization
 
+_DRAWS = 1000
 DELAY = "delay"
 """Key of `Params.aux`: random delay of an episode, control steps."""
 
@@ -151,6 +152,19 @@ def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[boo
     one = jax.tree.map(lambda x: x[0], params)
     found = [jax.tree.leaves(compiler.depends(each, jax.random.key(0), one)) for each in randomize]
     return [any(flags) for flags in zip(*found, strict=True)] if found else [False] * len(jax.tree.leaves(params))
+
+
+def with_random_lags(randomize: Sequence[Randomization], params: Params) -> Params:
+    """Parameters with the rotor lags of 1,000 draws of a team, where they are random."""
+    names = ("rotor_rise_time", "rotor_fall_time")
+    random = jax.tree.unflatten(jax.tree.structure(params), drawn_leaves(randomize, params))
+    if not any(getattr(random, name) for name in names):
+        return params
+
+    def lags(key: jax.Array) -> dict[str, Array]:
+        return {name: getattr(draw(randomize, key, params), name) for name in names}
+
+    return params.replace(**jax.jit(jax.vmap(lags))(jax.random.split(jax.random.key(0), _DRAWS)))
 
 
 @checked

@@ -18,7 +18,7 @@ from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_c
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import lagging_rotors
-from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.explicit import ExplicitStep, make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
@@ -38,6 +38,7 @@ from jaxdrones.envs.randomize import (
     delay_bounds,
     nominal_params,
     sensor_noise,
+    with_random_lags,
 )
 from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.errors import UserError
@@ -128,6 +129,11 @@ def make(
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
     nominal = equipped(task, nominal_params(randomize, nominal))
+    if "payload" in nominal.aux and any(isinstance(one, AnyVehicle) for one in randomize):
+        raise UserError(
+            f"{task.name} has loads for one vehicle, and every episode draws another; give a vehicle in place of "
+            "realistic='any' or AnyVehicle"
+        )
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     effects = [*effects, *(effect for effect in task.effects if effect not in effects)]
@@ -186,6 +192,8 @@ def make(
             f"{_MAX_STEPS:.0e}"
         )
     assert made.term_sizes  # checks the functions of the task
+    if isinstance(step, ExplicitStep) and step.physics.rotors_lag:
+        step.check_lag(with_random_lags(randomize, nominal))
     return made
 
 

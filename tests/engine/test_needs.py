@@ -13,6 +13,7 @@ from jaxdrones import assets, vehicles
 from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.engine import bullet
 from jaxdrones.engine.physics import Physics
+from jaxdrones.envs.randomize import scaled, shifted
 from jaxdrones.sensing import Scene, Sphere
 
 TEAM = jd.repeat(jd.load_params("cf2x"), 1)
@@ -200,6 +201,22 @@ def test_rotors_whose_lag_is_too_short_for_the_step_are_refused(rotors):
     ):
         with pytest.raises(ValueError, match=r"step is 0\.044 s and rotors that lag by 0\.02 s are stable up to 0\.04"):
             refused()
+
+
+def test_rotors_by_pwm_have_the_same_lag():
+    racer = jd.load_params("racer")
+    racer = jd.repeat(racer.replace(aux={"motors": jd.crazyflie_motors()}), 1)
+    step = jd.make_step(rotors=jd.pwm_rotors, dt=2.2 * float(racer.rotor_rise_time[0]))
+    with pytest.raises(ValueError, match=r"rotors that lag by 0\.02 s are stable up to 0\.04"):
+        step(racer, START, STILL)
+
+
+def test_random_lags_that_are_too_short_for_the_step_are_refused():
+    options = dict(vehicle="racer", rotors="lagging", control_hz=50, substeps=1)
+    jd.make("hover", randomize=(scaled("rotor_rise_time", 0.6, 1.5),), **options)
+    for law in (scaled("rotor_rise_time", 0.4, 1.5), shifted("rotor_fall_time", -0.015, 0.0)):
+        with pytest.raises(ValueError, match=r"step is 0\.02 s and rotors that lag by 0\.00"):
+            jd.make("hover", randomize=(law,), **options)
 
 
 def test_rotors_follow_at_the_longest_step_that_is_not_refused():

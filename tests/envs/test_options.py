@@ -70,6 +70,13 @@ def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
                 make("hover", **{option: value})
 
 
+@pytest.mark.parametrize("task", ["sling", "transport"])
+def test_loads_are_not_for_random_vehicles(task):
+    """A load of 30 % of the median vehicle is 3.2 times as heavy as the lightest ones."""
+    with pytest.raises(ValueError, match=f"{task} has loads for one vehicle, .* give a vehicle"):
+        make(task, realistic="any")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -23,6 +23,7 @@ from jaxdrones.flights.motion_tests import (
     rms,
     shift_test,
     turn_test,
+    typical,
 )
 from jaxdrones.flights.motor_order import check_motors
 
@@ -39,6 +40,7 @@ _DRAGS = np.linspace(0, 0.5, 6)  # 1/s; circles of a Crazyflie have 0.45
 _MAX_DELAY, _MIN_EXPLAINED = 0.05, 0.4  # s; of the misfit. Recorded flights have up to 0.02 s
 _MIN_CLIMB_CORRELATION = 0.5  # of heights by pos and by vel; recorded flights have 0.98 or more
 _OPPOSITE = -0.4  # correlation of vertical accelerations and thrust; recorded flights have 0.78 or more
+_FAR_BETTER = 0.25  # of the squared errors of the turns; recorded flights have 1.0 or more
 _MAX_RISE = 0.1  # V; largest rise of a battery when the motors start
 
 
@@ -81,6 +83,7 @@ _READINGS: dict[str, tuple[Change, ...]] = {
         ("omega has the opposite sign", np.negative),
     ),
 }
+_WORLD_RATES = "omega looks like world axes"
 _ALL_NED = "all columns look like NED axes (z down in world and body)"
 
 
@@ -90,7 +93,9 @@ def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]
     Motion and relative thrusts (T, 4) are those of the rows with running motors; `sag` is the battery's at take-off, V.
     """
     found, read = _check_axes(motion)
-    found = found or _check_scales(motion) or _check_headings(motion) or _check_delay(motion)
+    found = (
+        found or _check_scales(motion) or _check_headings(motion) or _check_rate_axes(motion) or _check_delay(motion)
+    )
     found = found + _check_lift(thrusts, read) + check_motors(thrusts, read.attitude, read.vel, read.omega)
     if sag < -_MAX_RISE:
         found.append(f"vbat rises by {-sag:.2f} V when the motors start: the load of the battery has the wrong sign")
@@ -133,6 +138,7 @@ def _readings(logged: Motion):
     """Other conventions of the columns, fewest changes first: causes, and converted columns."""
     every = [(name, cause, change) for name, changes in _READINGS.items() for cause, change in changes]
     yield ["vel looks like body axes"], logged._replace(vel=logged.attitude.apply(logged.vel))
+    yield [_WORLD_RATES], _with_world_rates(logged)
     yield (
         [_ALL_NED],
         Motion(_flipped(logged.pos), _turned(logged.attitude), _flipped(logged.vel), _flipped(logged.omega)),
@@ -209,6 +215,23 @@ def _check_headings(motion: Motion) -> list[str]:
         for name, alike, axes in tests
         if abs(angle := min(map(_heading, alike), key=abs)) > _MAX_HEADING
     ]
+
+
+def _with_world_rates(motion: Motion) -> Motion:
+    """Motion whose logged rates are in world axes."""
+    return motion._replace(omega=motion.attitude.inv().apply(motion.omega))
+
+
+def _check_rate_axes(motion: Motion) -> list[str]:
+    """Check that the rates fit the attitude in body axes, not far better in world axes.
+
+    Both have the same heading rate, which alone hides the others in a fast turn.
+    """
+    body, world = (turn_test(x.attitude, x.omega) for x in (motion, _with_world_rates(motion)))
+    if not body.observable or rms(body.implied - world.implied) < body.min_motion:
+        return []
+    errors = [typical(test.has - test.implied) for test in (body, world)]
+    return [_WORLD_RATES] if errors[1] < _FAR_BETTER * errors[0] else []
 
 
 def _check_delay(motion: Motion) -> list[str]:

@@ -117,6 +117,23 @@ def test_the_thrust_of_a_circle_tilts_against_the_drag_too(turned, found, way):
     assert len(said) == bool(found) and found in "".join(said)
 
 
+@pytest.mark.parametrize("heading_rate", [0.3, 0.5, 1.5, 3.0])
+def test_rates_in_world_axes_are_named_in_a_turning_flight(heading_rate):
+    """They have the same heading rate, which alone hides the others in a fast turn."""
+    t = np.arange(2000) * 0.01
+    angles = np.stack([heading_rate * t, 0.25 * np.cos(1.7 * t), 0.3 * np.sin(2 * t)], axis=1)
+    attitude = Rotation.from_euler("ZYX", angles)
+    turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / 0.01
+    omega = np.concatenate([turns[:1], (turns[1:] + turns[:-1]) / 2, turns[-1:]])
+    up = attitude.apply([0, 0, 1.0])
+    vel = np.cumsum(9.81 * up / up[:, 2:] - [0, 0, 9.81], axis=0) * 0.01
+    vel = vel - np.mean(vel, axis=0)
+    sound = Motion(np.cumsum(vel, axis=0) * 0.01, attitude, vel, omega)
+    assert contradictions(sound, np.zeros((0, 4)), 0.0) == []
+    (said,) = contradictions(sound._replace(omega=attitude.apply(omega)), np.zeros((0, 4)), 0.0)
+    assert "omega looks like world axes" in said
+
+
 def test_a_battery_that_is_charged_by_its_load_is_refused(tmp_path, columns_of):
     sound = columns_of(load_flights("B3_figure8_slow_rep2")[0])
     with pytest.raises(ValueError, match="the load of the battery has the wrong sign"):

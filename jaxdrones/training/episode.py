@@ -170,12 +170,14 @@ def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple
 
 
 def _held(rows: tuple, before: tuple) -> tuple:
-    """Rows of a leg with the last values, of `before` it, of every drone whose episode has ended."""
+    """Rows of a leg with the last values, of `before` it, of every drone whose episode has ended, and no reward."""
+    reward = rows[2]  # zero after the end
     at = slice(0, 1) if before is rows else slice(-1, None)
     rows = jax.tree.map(lambda old, new: np.concatenate([old[at], new]), before, rows)
     active = rows[-1]
     last = np.maximum.accumulate(np.where(active, np.arange(len(active))[:, None], 0), axis=0)[1:]
-    return jax.tree.map(lambda x: x[last, np.arange(active.shape[1])], rows)
+    drones, target, _, *others = jax.tree.map(lambda x: x[last, np.arange(active.shape[1])], rows)
+    return drones, target, reward, *others
 
 
 def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:

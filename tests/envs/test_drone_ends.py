@@ -249,3 +249,4 @@ def test_the_log_of_an_episode_holds_the_last_state_of_a_drone_that_left():
     assert (
         np.all(log.metrics["error"][ended:, 0] == log.metrics["error"][ended, 0]) and np.abs(log.drones.pos).max() < 5
     )
+    np.testing.assert_array_equal(log.reward, np.stack([np.arange(STEPS) <= ended, np.ones(STEPS)], axis=1))

@@ -57,7 +57,8 @@ def from_urdf(
     obstacles = []
     for name, link in links.items():
         material = link.find("visual/material")
-        paint = None if material is None else palette.get(material.get("name"))
+        own = None if material is None else material.find("color")
+        paint = palette.get(material.get("name")) if own is None and material is not None else own
         color = GREY if paint is None else _numbers(file, paint, "rgba", 4, "")
         for collision in link.findall("collision"):
             placed = _in_parent(places[name], _pose(file, collision))

@@ -183,6 +183,18 @@ ARM = """<robot name="arm">
 </robot>"""
 
 
+def test_links_with_colors_of_their_own_have_these(tmp_path):
+    """Materials without a name, and one whose name has another color elsewhere in the file."""
+    materials = ['<material><color rgba="1 0 0 1"/></material>', '<material><color rgba="0 1 0 1"/></material>']
+    materials += [f'<material name="paint"><color rgba="{x} 0 1 1"/></material>' for x in (0.5, 0.25)]
+    shape = '<collision><geometry><sphere radius="1"/></geometry></collision>'
+    links = [f'<link name="{i}"><visual>{x}</visual>{shape}</link>' for i, x in enumerate(materials)]
+    joints = [f'<joint name="j{i}"><parent link="0"/><child link="{i}"/></joint>' for i in range(1, len(links))]
+    (tmp_path / "a.urdf").write_text(f'<robot name="a">{"".join(links + joints)}</robot>')
+    colors = np.asarray(from_urdf(tmp_path / "a.urdf").spheres.color)
+    np.testing.assert_array_equal(colors, [[1, 0, 0, 1], [0, 1, 0, 1], [0.5, 0, 1, 1], [0.25, 0, 1, 1]])
+
+
 def test_a_scene_from_a_urdf_has_its_shapes_where_its_links_are(tmp_path):
     (tmp_path / "a.obj").write_text(CUBE)
     file = tmp_path / "arm.urdf"

@@ -67,7 +67,7 @@ class Camera:
         for name, length in ("principal_point", 2), ("offset", 3), ("orientation", 4):
             value = getattr(self, name)
             if value is not None:
-                if np.shape(value) != (length,):
+                if np.shape(value) != (length,) or not np.isfinite(value).all():
                     raise UserError(f"{name} of a camera is {short_repr(value)}; give {length} numbers")
                 object.__setattr__(self, name, tuple(map(float, value)))
         length = math.hypot(*self.orientation)

@@ -1,11 +1,13 @@
 """Barometer and magnetometer."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked, shape
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -13,6 +15,7 @@ from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 
+_FIELD = shape(3, meaning="x, y, z, uT, world", name="{argument} of a {function}", finite=True)
 _PASCAL = 1 / 12.013  # m; height at sea level over which the pressure of the ISA falls by 1 Pa: 1 / (1.225 x 9.80665)
 
 BMP388 = Noise(density=0.03 * _PASCAL, turn_on=8 * _PASCAL)
@@ -35,9 +38,10 @@ def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer
     return _noisy(name, errors, rate, 1, lambda state: state.pos[2:], entries)
 
 
+@checked
 def magnetometer(
     errors: Noise = LIS3MDL,
-    field: tuple[float, float, float] = EUROPE,
+    field: Annotated[tuple[float, float, float], _FIELD] = EUROPE,
     rate: float = 20.0,
     name: str = "magnetometer",
 ) -> Sensor:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked, shape
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -20,6 +22,7 @@ from jaxdrones.vector import along_z, cross
 STANDARD_GRAVITY = 9.80665
 """m/s^2; what a data sheet calls g."""
 _DEGREE = math.pi / 180
+_OFFSET = shape(3, meaning="x, y, z, m, body", name="{argument} of an {function}", finite=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,10 +52,11 @@ MPU9250 = ImuPart(
 sqrt(Hz) and offsets of +-60 mg and +-5 degrees/s, used as standard deviations. It does not state their stability."""
 
 
+@checked
 def imu(
     part: ImuPart = BMI088,
     rate: float = 100.0,
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset: Annotated[tuple[float, float, float], _OFFSET] = (0.0, 0.0, 0.0),
     name: str = "imu",
 ) -> Sensor:
     """Inertial measurement unit; its reading is `acc` (3,), specific force, m/s^2, and `gyro` (3,), rad/s, body.

@@ -76,6 +76,9 @@ def _to_ground(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float
     return jnp.where(height > 0, far, 0)
 
 
+_OFFSET = shape(3, meaning="x, y, z, m, body", name="{argument} of a range finder", finite=True)
+
+
 @checked
 def range_finder(
     name: str,
@@ -85,7 +88,7 @@ def range_finder(
     rate: float | None = None,
     noise: Annotated[float, number("m", "{argument} of a range finder", at_least=0)] = 0.0,
     dropout: Annotated[float, number("a share", "{argument} of a range finder", at_least=0, at_most=1)] = 0.0,
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset: Annotated[tuple[float, float, float], _OFFSET] = (0.0, 0.0, 0.0),
     orientation: Annotated[tuple[float, ...], quaternion("{argument} of a range finder")] = _IDENTITY,
 ) -> Sensor:
     """Range finder with one or more beams; its reading (...) are the ranges, m, at most `max_range`.

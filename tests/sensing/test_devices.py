@@ -9,7 +9,17 @@ from sensing.estimates import along, few, flights
 
 import jaxdrones as jd
 from jaxdrones.dynamics.rigid_body import quat_rate
-from jaxdrones.sensing import EUROPE, PERFECT, MotionCaptureSystem, Noise, barometer, imu, magnetometer, motion_capture
+from jaxdrones.sensing import (
+    EUROPE,
+    PERFECT,
+    MotionCaptureSystem,
+    Noise,
+    barometer,
+    downward_range,
+    imu,
+    magnetometer,
+    motion_capture,
+)
 from jaxdrones.sensing.inertial import mean_motion, motion
 
 KEY = jax.random.key(1)
@@ -156,3 +166,21 @@ def test_height_and_magnetic_field_are_those_of_the_pose(flown):
     np.testing.assert_allclose(
         each(jd.rotation.rotate, states.quat, read), np.broadcast_to(EUROPE, read.shape), atol=1e-9
     )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: imu(offset=(0, np.nan, 0)), "offset of an imu is not finite"),
+        (lambda: imu(offset=(1, 2)), r"offset of an imu has shape \(2,\); expected \(3,\)"),
+        (lambda: magnetometer(field=(np.nan, 0, 0)), "field of a magnetometer is not finite"),
+        (lambda: magnetometer(field=(1, 2)), r"field of a magnetometer has shape \(2,\)"),
+        (lambda: downward_range(offset=(np.nan, 0, 0)), "offset of a range finder is not finite"),
+        (lambda: jd.Camera(principal_point=(np.nan, 0)), "principal_point of a camera is .*nan.*; give 2 numbers"),
+        (lambda: jd.Camera(offset=(np.inf, 0, 0)), "offset of a camera is .*inf.*; give 3 numbers"),
+    ],
+)
+def test_places_and_fields_that_are_none_are_refused(make, message):
+    """With them readings were NaN, and ranges and depths zero or empty."""
+    with pytest.raises(ValueError, match=message):
+        make()

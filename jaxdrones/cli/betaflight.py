@@ -18,7 +18,7 @@ from jaxdrones.firmware import betaflight
 from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
 from jaxdrones.firmware.betaflight.link import connect_msp
-from jaxdrones.firmware.betaflight.pilots import Pilot
+from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 from jaxdrones.training.betaflight_pilot import PolicyPilot
@@ -57,7 +57,9 @@ def add(commands) -> None:
         help="axes of roll, pitch, throttle, yaw (0,1,2,3); -1 is axis 0 reversed, -2 is axis 1 reversed, ...",
     )
     clock.add_argument("--duration", type=float, metavar="S", help="simulated time after arming, s (until Ctrl-C)")
-    clock.add_argument("--physics-hz", type=int, default=1000, metavar="HZ", help="states per second (1000)")
+    clock.add_argument(
+        "--physics-hz", type=int, default=1000, metavar="HZ", help="states per second, a multiple of 100 (1000)"
+    )
     clock.add_argument(
         "--real-time", action="store_true", help="follow the clock; by default each step waits for motor outputs"
     )
@@ -122,6 +124,10 @@ def _check(options: argparse.Namespace) -> None:
         raise UserError("--policy and --joystick are given; give one of them")
     if options.joystick is not None and options.flip is not None:
         raise UserError("--flip is given beside --joystick; leave it out")
+    if options.physics_hz % round(1 / PERIOD):
+        raise UserError(
+            f"--physics-hz is {options.physics_hz}; give a multiple of {1 / PERIOD:g}, the rate of the sticks"
+        )
     options.target = _numbers("target", options.target, 3, float)
     options.axes = _numbers("axes", options.axes, 4, int)
 

@@ -81,6 +81,7 @@ def test_noise_is_no_traceback_and_a_signal_ends_a_flight_with_its_log(simulated
         (["betaflight", "--target", "1,2,nan"], "--target is '1,2,nan'; give 3 numbers"),
         (["betaflight", "--axes", "0,1,2,x"], "--axes is '0,1,2,x'; give 4 numbers"),
         (["betaflight", "--flip", "-1"], "flip is -1.0"),
+        (["betaflight", "--physics-hz", "150"], "--physics-hz is 150; give a multiple of 100, the rate of the sticks"),
         (["betaflight", "--physics-hz", "0"], "rate of the physics (Hz) is 0"),
         (["betaflight", "--joystick", "js", "--policy", "run"], "--policy and --joystick are given"),
         (["betaflight", "--joystick", "js", "--flip", "1"], "--flip is given beside --joystick"),

@@ -1,13 +1,14 @@
 """On-board state estimation from an IMU and motion capture."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number
+from jaxdrones.arguments import Hertz, checked
+from jaxdrones.checks import check_number, check_shape
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -21,6 +22,13 @@ from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 
 _ROUNDING = 1e-6  # of a number of periods
+
+
+def _check_start(name: str, start: Any) -> None:
+    """Raise unless these are three standard deviations."""
+    check_shape(f"{name} of state_estimate", start, (3,), "of position (m), velocity (m/s) and angle (rad)")
+    for deviation in start:
+        check_number(f"{name} of state_estimate", deviation, at_least=0)
 
 
 class Sample(PyTreeNode):
@@ -61,13 +69,14 @@ def imu_noise(part: ImuPart) -> kalman.ImuNoise:
     return kalman.ImuNoise(*(jnp.asarray(density, float) for density in densities))
 
 
+@checked
 def state_estimate(
     part: ImuPart = BMI088,
     system: MotionCaptureSystem = VICON,
-    rate: float = 100.0,
+    rate: Hertz = 100.0,
     *,
     attitude: bool = True,
-    start: tuple[float, float, float] = (0.001, 0.02, 0.01),
+    start: Annotated[tuple[float, float, float], _check_start] = (0.001, 0.02, 0.01),
     name: str = "state_estimate",
 ) -> Sensor:
     """State estimate of an error-state Kalman filter; its reading is a `State` for policies and controllers.

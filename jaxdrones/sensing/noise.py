@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.arguments import checked, number
+from jaxdrones.arguments import Count, Seconds, checked, number
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
@@ -109,17 +109,20 @@ class Noise:
         return np.sqrt(self.density**2 / t + drift + self.random_walk**2 * t / 3)
 
 
-def allan_deviation(readings: ArrayLike, dt: float, samples: int) -> np.ndarray:
+@checked
+def allan_deviation(readings: ArrayLike, dt: Seconds, samples: Count) -> np.ndarray:
     """Overlapping Allan deviation (...) of readings (n, ...) at rest, `dt` (s) apart, in units of a reading.
 
     Further axes are channels. The averaging time is the number of `samples` in an average times `dt`.
 
     Raises:
-        ValueError: fewer than 2 `samples` + 1 readings.
+        ValueError: fewer than 2 `samples` + 1 readings, or readings that are not finite.
     """
     readings = np.asarray(readings, float)
     if readings.ndim < 1 or len(readings) <= 2 * samples:
         raise UserError(f"{readings.shape} readings are too few to average {samples}; give at least {2 * samples + 1}")
+    if not np.isfinite(readings).all():
+        raise UserError("some readings are not finite; remove or repair them")
     angle = np.concatenate([np.zeros_like(readings[:1]), np.cumsum(readings - readings.mean(axis=0), axis=0)]) * dt
     change = angle[2 * samples :] - 2 * angle[samples:-samples] + angle[: -2 * samples]
     return np.sqrt(np.mean(change**2, axis=0) / 2) / (samples * dt)

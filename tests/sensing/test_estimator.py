@@ -277,6 +277,10 @@ def test_an_estimate_has_a_gradient_through_the_flight(flown):
         (lambda: state_estimate(rate=50.0), "rate of the poses of state_estimate is 100 Hz, 0.5 periods"),
         (lambda: state_estimate(system=dataclasses.replace(VICON, delay=0.015)), "delay of the poses .* 1.5 periods"),
         (lambda: state_estimate(system=MotionCaptureSystem()), "pos_noise of state_estimate is 0.0; give a positive"),
+        (lambda: state_estimate(rate=np.nan), "rate is nan; give a positive number"),
+        (lambda: state_estimate(start=(-1, 0, 0)), "start of state_estimate is -1; give a number of at least 0"),
+        (lambda: state_estimate(start=(0.1, np.nan, 0)), "start of state_estimate is nan"),
+        (lambda: state_estimate(start=(1, 2)), r"start of state_estimate has shape \(2,\)"),
         (lambda: barometer(rate=0), "rate of sensor 'barometer' is 0"),
         (
             lambda: jd.make("hover", sensors=(imu(rate=500.0),)),

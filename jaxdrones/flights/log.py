@@ -147,9 +147,15 @@ class FlightLog:
         return np.asarray(jax.jit(jax.vmap(jax.vmap(rotation.to_rpy)))(jnp.asarray(self.quat)))
 
     @property
+    def begin(self) -> float:
+        """Start of the flight, s: 0, or the first time of a log that begins later than it lasts and than 1 s."""
+        first, last = float(self.t[0]), float(self.t[-1])
+        return first if first > max(last - first, 1.0) else 0.0
+
+    @property
     def last_quarter(self) -> np.ndarray:
         """(K,) mask of the last quarter of the flight."""
-        return self.t >= self.t[-1] * 3 / 4
+        return self.t - self.begin >= (self.t[-1] - self.begin) * 3 / 4
 
     @property
     def error(self) -> np.ndarray:

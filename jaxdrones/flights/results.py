@@ -33,7 +33,7 @@ def diverged(log: FlightLog) -> dict[str, str]:
 
 
 def results(log: FlightLog, after: float) -> list[dict[str, float | str | None]]:
-    """Table with a row per drone, from time `after` (s), or over the second half of a shorter flight.
+    """Table with a row per drone, from time `after` (s) of the flight, or over the second half of a shorter flight.
 
     The error is the distance to the target position, or the difference to the target velocity. The steady error
     is its mean over the last quarter of the flight. The settling time is the first time after which the error stays
@@ -49,7 +49,7 @@ def results(log: FlightLog, after: float) -> list[dict[str, float | str | None]]
             f"rms_error_{unit}": np.sqrt(np.mean(error[counted] ** 2, axis=0)),
             f"peak_error_{unit}": error[counted].max(axis=0),
             f"steady_error_{unit}": error[steady].mean(axis=0),
-            "settled_after_s": [_settling(log.t, e, steady) for e in error.T],
+            "settled_after_s": [_settling(log.t - log.begin, e, steady) for e in error.T],
             "lowest_z_m": log.pos[counted, :, 2].min(axis=0),
             "highest_z_m": log.pos[counted, :, 2].max(axis=0),
             "peak_vz_m_s": log.vel[counted, :, 2].max(axis=0),
@@ -95,7 +95,8 @@ def divergence(log: FlightLog, other: FlightLog) -> list[dict[str, float]]:
 
 def counted_from(log: FlightLog, after: float) -> float:
     """Start of the evaluation, s."""
-    return after if after < log.t[-1] else float(log.t[-1]) / 2
+    duration = float(log.t[-1]) - log.begin
+    return log.begin + (after if after < duration else duration / 2)
 
 
 def _settling(t: np.ndarray, error: np.ndarray, steady: np.ndarray) -> float:

@@ -61,7 +61,7 @@ def film(
     def reported() -> Iterator[np.ndarray]:
         for k, frame in enumerate(frames):
             yield frame
-            on_frame(min(1.0, (k + 1) / max(1, round(record.t[-1] * fps))))
+            on_frame(min(1.0, (k + 1) / max(1, round((record.t[-1] - record.begin) * fps))))
 
     with contextlib.closing(frames):
         return video.write(reported(), path, fps)

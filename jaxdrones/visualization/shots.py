@@ -94,7 +94,7 @@ def rows_of_frames(record: FlightLog, fps: int) -> np.ndarray:
     finite = _finite_rows(record)
     if not len(finite):
         raise UserError("the film is not written: no state of the flight is finite")
-    times = np.arange(max(1, round(record.t[-1] * fps))) / fps
+    times = record.begin + np.arange(max(1, round((record.t[-1] - record.begin) * fps))) / fps
     return finite[[int(np.abs(record.t[finite] - time).argmin()) for time in times]]
 
 

@@ -83,6 +83,19 @@ def test_a_state_that_is_not_finite_for_a_moment_is_named():
     assert "t = 0.060 s" in diverged(changed(hovering(), "pos", 5, np.nan))["drone 1"]
 
 
+@pytest.mark.parametrize("begin", [1e3, 1.7e9])
+def test_a_flight_by_another_clock_has_the_same_results(begin):
+    """Its last quarter and its settling do not count from a zero that it never saw."""
+    record = changed(hovering(steps=400), "pos", slice(0, 150), [1.0, 0, 1])
+    late = dataclasses.replace(record, t=record.t + begin)
+    for found, expected in zip(results(late, 1.005), results(record, 1.005), strict=True):
+        assert found.pop("drone") == expected.pop("drone")
+        assert found.pop("settled_after_s") == pytest.approx(expected.pop("settled_after_s"), abs=0.02)
+        assert found == pytest.approx(expected, rel=0.01)
+    assert late.begin == late.t[0] and record.begin == 0
+    assert "all other numbers count from 1001.0" in definitions(dataclasses.replace(record, t=record.t + 1e3), 1.005)
+
+
 def test_pwm_is_of_a_crazyflie():
     record = dataclasses.replace(hovering(), conditions=Conditions("circle", vehicle="racer"))
     assert "pwm" in arrays_of(hovering(), pwm=True)

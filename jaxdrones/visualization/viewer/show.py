@@ -89,15 +89,11 @@ def show(
 
 
 def _from_start(record: FlightLog) -> FlightLog:
-    """Log with times from its first row, if it begins later than it lasts and after 1 s, as by the time of the day.
-
-    A page begins at 0 s and has times in float32.
-    """
-    begin = record.t[0]
-    if begin <= max(record.t[-1] - begin, 1.0):
+    """Log with times from the start of the flight: a page begins at 0 s and has times in float32."""
+    if not record.begin:
         return record
-    images = {name: ImageSequence(x.t - begin, x.frames) for name, x in record.images.items()}
-    return dataclasses.replace(record, t=record.t - begin, images=images)
+    images = {name: ImageSequence(x.t - record.begin, x.frames) for name, x in record.images.items()}
+    return dataclasses.replace(record, t=record.t - record.begin, images=images)
 
 
 def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:

@@ -16,6 +16,7 @@ from helpers import SMALL_OPTIONS
 from jaxdrones.cli import main
 from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
+from jaxdrones.cli.settings import with_config
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training import trainer
@@ -276,6 +277,14 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     assert "hover by shac" in capsys.readouterr().out
 
 
+def test_a_file_of_options_is_read_however_it_is_given(tmp_path):
+    file = tmp_path / "options.toml"
+    file.write_text("seeds = 3\n[set]\nhidden_sizes = [8]\n[sweep]\nhorizon = 5\ngamma = [0.9, 0.99]\n")
+    read = ["train", "hover", "--seeds=3", "--set=hidden_sizes=[8]", "--sweep=horizon=5", "--sweep=gamma=0.9,0.99"]
+    for words in (["--config", str(file)], [f"--config={file}"]):
+        assert with_config(["train", "hover", *words]) == read
+
+
 @pytest.mark.slow
 def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
     """Options of the command line override those of the file."""
@@ -300,6 +309,8 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--log", "tensorboard,csv"], "give names of tensorboard, wandb, mlflow"),
         (["train", "hover", "--sweep", "horizon=2,3", "--set", "horizon=2"], "given by --set and by --sweep"),
         (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
+        (["train", "hover", "--config=none.toml"], "--config none.toml cannot be read"),
+        (["train", "hover", "--config", "none.toml", "--config=none.toml"], "--config is given twice"),
         (["train", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),
         (["train", "hover", "--algo", "pppo"], "unknown algorithm 'pppo'; did you mean 'ppo'"),
         (["train", "hover", "--set", "wrlds=3"], "unknown setting 'wrlds'; did you mean 'worlds'"),

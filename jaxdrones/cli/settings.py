@@ -53,11 +53,14 @@ def task_first(arguments: list[str]) -> list[str]:
 
 def with_config(arguments: list[str]) -> list[str]:
     """Insert the options of `train --config FILE`; options of the command line override them."""
+    arguments = [x for word in arguments for x in (word.split("=", 1) if word.startswith("--config=") else [word])]
     command = next((i for i, word in enumerate(arguments) if not word.startswith("-")), None)
     if command is None or arguments[command] != "train" or "--config" not in arguments[:-1]:
         return arguments
     i = arguments.index("--config")
     file, rest = Path(arguments[i + 1]), [*arguments[:i], *arguments[i + 2 :]]
+    if "--config" in rest:
+        raise UserError("--config is given twice; give one file")
     try:
         entries = tomllib.loads(file.read_text())
     except (OSError, ValueError) as error:
@@ -66,7 +69,8 @@ def with_config(arguments: list[str]) -> list[str]:
     options = []
     for name, x in entries.items():
         if isinstance(x, dict):  # set and sweep
-            values = {key: ",".join(map(str, value)) if name == "sweep" else value for key, value in x.items()}
+            lists = {key: value if isinstance(value, list) else [value] for key, value in x.items()}
+            values = {key: ",".join(map(str, value)) for key, value in lists.items()} if name == "sweep" else x
             options += [f"--{name}={key}={value}" for key, value in values.items()]
         elif x is not False:
             options.append(f"--{name}" if x is True else f"--{name}={x}")

@@ -192,8 +192,9 @@ def make(
             f"{_MAX_STEPS:.0e}"
         )
     assert made.term_sizes  # checks the functions of the task
-    if isinstance(step, ExplicitStep) and step.physics.rotors_lag:
-        step.check_lag(with_random_lags(randomize, nominal))
+    own = [one for one in randomize if one not in REALISTIC_RANDOMIZATION and not isinstance(one, AnyVehicle)]
+    if isinstance(step, ExplicitStep) and step.physics.rotors_lag and own:
+        step.check_lag(with_random_lags(own, nominal))
     return made
 
 

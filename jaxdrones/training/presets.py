@@ -94,7 +94,8 @@ _CROSSING_PPO = _SLOW_PPO | dict(
 
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # The exact gradient fails for 1 of 10 seeds; that of a rigid body costs two thirds, and learns as well.
-    ("hover", "bptt"): dict(gradient="surrogate", learning_rate=1.5e-2, restart_fraction=0.3),
+    # Without the limit 3 of 166 seeds end 5 to 37 cm beside the goal, after gradients a thousand times as long.
+    ("hover", "bptt"): dict(gradient="surrogate", learning_rate=1.5e-2, restart_fraction=0.3, outlier_gradient=30.0),
     ("hover", "ppo"): dict(anneal_fraction=0.5),
     ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),

@@ -17,6 +17,7 @@ depth at the edges of obstacles.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
 
@@ -146,21 +147,25 @@ def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Arr
 
 
 class SurrogateStep(Step):
-    """Step with the values of `step` and the derivatives of `surrogate` at the same state."""
+    """Step with the values of `step` and the derivatives of `surrogate` at the same state.
+
+    Parameters and scene are constants to it: their derivatives are zero.
+    """
 
     def __init__(self, step: Step, surrogate: Callable[[Params, State, Array], State]):
         self.physics, self._step = step.physics, step
 
         @jax.custom_vjp
-        def mixed(scene, *arguments):
-            return step(*arguments, scene)
+        def mixed(scene, params, state, rpm):
+            return step(params, state, rpm, scene)
 
-        def forward(scene, *arguments):
-            return step(*arguments, scene), (scene, arguments)
+        def forward(scene, params, state, rpm):
+            return step(params, state, rpm, scene), (scene, params, state, rpm)
 
         def backward(saved, cotangent):
-            scene, arguments = saved
-            return jax.tree.map(jnp.zeros_like, scene), *jax.vjp(surrogate, *arguments)[1](cotangent)
+            scene, params, *arguments = saved
+            constants = jax.tree.map(jnp.zeros_like, (scene, params))
+            return *constants, *jax.vjp(functools.partial(surrogate, params), *arguments)[1](cotangent)
 
         mixed.defvjp(forward, backward)
         self._mixed = mixed

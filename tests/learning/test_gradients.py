@@ -39,6 +39,8 @@ def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other(
     assert height(mixed, rpm) == height(fine, rpm)
     mine, theirs = (jax.grad(height, 1)(step, rpm) for step in (mixed, coarse))
     np.testing.assert_allclose(mine, theirs, rtol=1e-12)
+    in_params = jax.grad(lambda params: mixed(params, state, rpm).pos[0, 2])(params)
+    assert not any(np.any(x) for x in jax.tree.leaves(in_params))
 
 
 @pytest.fixture(scope="module")

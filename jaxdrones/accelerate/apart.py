@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler, one_world
 from jaxdrones.accelerate.chunks import kernel_of_chunks
-from jaxdrones.accelerate.fitting import can_be_a_kernel, fits_number_by_number
+from jaxdrones.accelerate.fitting import NoKernelError, can_be_a_kernel, fits_number_by_number
 from jaxdrones.accelerate.soa import over_last_axis
 
 P = ParamSpec("P")
@@ -53,8 +53,9 @@ def _fits(program: Any) -> bool:
 def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: int | None) -> list[Array]:
     if worlds is None:
         return compiler.as_function(program, ())(*inputs)
-    if not _fits(program):  # a derivative can be larger than its function
-        return one_world.by_vmap(program, mapped, worlds)(*inputs)
+    by_vmap = one_world.by_vmap(program, mapped, worlds)
+    if not worlds or not _fits(program):  # a derivative can be larger than its function
+        return by_vmap(*inputs)
 
     def many(same: Sequence[Array], varying: Sequence[Array]) -> list[Array]:
         found = {True: iter([jnp.moveaxis(x, 0, -1) for x in varying]), False: iter(same)}
@@ -62,7 +63,10 @@ def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: in
         return [jnp.moveaxis(x, -1, 0) for x in results]
 
     same, varying = ([x for x, varies in zip(inputs, mapped, strict=True) if varies == wanted] for wanted in (0, 1))
-    return kernel_of_chunks(many, same, varying, worlds) if compiler.is_cpu() else many(same, varying)
+    try:
+        return kernel_of_chunks(many, same, varying, worlds) if compiler.is_cpu() else many(same, varying)
+    except (NoKernelError, compiler.UnknownError):  # an equation of an unsupported form
+        return by_vmap(*inputs)
 
 
 def _at_once(*inputs: Array, **params: Any) -> list[Array]:

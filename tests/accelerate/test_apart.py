@@ -115,6 +115,19 @@ def test_what_cannot_be_apart_is_as_vmap_computes_it(size):
     np.testing.assert_array_equal(ours(x), jax.vmap(function)(x))
 
 
+def test_a_place_that_differs_between_worlds_is_as_vmap_computes_it():
+    def written(x, i):
+        return jax.lax.dynamic_update_slice(x, 2 * x[:1], (i,))
+
+    places = jnp.arange(5) % 3
+    found = jax.jit(jax.vmap(apart_under_vmap(written)))(X, places)
+    np.testing.assert_array_equal(found, jax.vmap(written)(X, places))
+
+
+def test_no_worlds_are_none():
+    assert jax.vmap(apart_under_vmap(lambda x: 2 * x))(X[:0]).shape == (0, 3)
+
+
 def test_many_worlds_are_one_kernel_and_one_world_is_none():
     function = apart_under_vmap(swung)
     assert jax.jit(jax.vmap(function)).lower(X, PUSH).as_text().count("small_call") == 1

@@ -56,7 +56,8 @@ def scene_of(level: int) -> Scene | Callable[[jax.Array], Scene]:
     """
     if level not in LEVELS:
         raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
-    return _scene(level) if level < 2 else functools.partial(_scene, level)
+    scene = functools.partial(_scene, level)
+    return jax.jit(scene)() if level < 2 else scene
 
 
 def randomization_of(level: int) -> tuple[Callable[[jax.Array, Params], Params], ...]:

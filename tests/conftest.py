@@ -1,5 +1,6 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
+import gc
 import importlib.util
 import os
 from pathlib import Path
@@ -20,6 +21,9 @@ jaxtyping.install_import_hook(sorted(MODULES), "shapes.checked")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.devices()  # one, whichever test comes first: `jaxdrones train` makes each core one if JAX does not run
+
+gc.freeze()
+gc.set_threshold(50_000)  # tracing makes many objects and little garbage: a twentieth of the time
 
 pytest_plugins = ["shards"]
 

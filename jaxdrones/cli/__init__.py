@@ -1,6 +1,7 @@
 """Command line: `jaxdrones fly`, `train`, `eval` and others; a file per command."""
 
 import argparse
+import gc
 import sys
 
 from jaxdrones.cli import (
@@ -29,6 +30,7 @@ from jaxdrones.cli.settings import task_first, with_config
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code, see `EXIT_CODES`."""
+    gc.set_threshold(50_000)  # tracing makes many objects and little garbage
     parser, debug = _parser(), False
     try:
         options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))

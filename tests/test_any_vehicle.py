@@ -259,6 +259,7 @@ def test_as_many_light_as_heavy_vehicles_are_drawn(drawn):
     assert np.abs(share - 0.2).max() < 4 * np.sqrt(0.2 * 0.8 / len(drawn.mass))
 
 
+@pytest.mark.slow
 def test_a_thousand_drawn_vehicles_hover(drawn):
     """With lagging rotors, the reaction of their inertia and drag, from 0.3 m away and tilted by 20 degrees."""
     distance, speed = hover_errors(drawn, jax.random.key(1), seconds=10)

@@ -54,6 +54,7 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert report["seconds"]["training"] > 0 and report["seconds"]["compiling"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.needs("tensorboardX")
 def test_a_logger_of_the_command_line_gets_every_update(monkeypatch, tmp_path):
     logged = []

@@ -46,11 +46,13 @@ def test_scored_starts_are_others_than_those_of_tuning_and_training():
     assert np.min(np.linalg.norm(scored[:, None] - tuning[None], axis=-1)) > 1e-3
 
 
+@pytest.mark.slow
 def test_a_pilot_that_does_nothing_never_succeeds(rows):
     assert rows[0]["pilot"] == "nothing" and rows[0]["success"] == 0
     assert rows[1]["success"] > 0 and rows[1]["distinct"] == 4
 
 
+@pytest.mark.slow
 def test_a_row_reports_success_error_effort_and_costs(rows):
     for row in rows:
         low, high = row["interval"]
@@ -59,6 +61,7 @@ def test_a_row_reports_success_error_effort_and_costs(rows):
     assert rows[0]["flown"] == 0 and rows[1]["flown"] == pytest.approx(16 * 4 * 5.0)
 
 
+@pytest.mark.slow
 def test_the_page_is_written_from_the_results(rows, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("Table:\n\n<!-- measured: leaderboard -->\n<!-- end -->\n")

@@ -88,6 +88,7 @@ def test_an_argument_may_be_of_no_use():
     assert_close(inside, jax.jit(jax.vmap(gradient))(starts, commands), 1e-12)
 
 
+@pytest.mark.slow
 def test_random_numbers_that_do_not_matter_prevent_no_kernel(monkeypatch):
     def reached(start, commands, key):
         _ = jax.random.normal(key)  # as in an environment without noise
@@ -232,6 +233,7 @@ def test_without_the_interfaces_that_it_needs_it_is_vmap_and_says_so_once(monkey
     assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
 
 
+@pytest.mark.slow
 def test_an_equation_that_is_not_as_expected_makes_it_vmap_too(monkeypatch):
     def strange(equation):
         raise compiler.UnknownError("scan has x")

@@ -57,6 +57,7 @@ def test_an_agent_of_rllib_leaves(env):
         assert truncated == dict.fromkeys((*flying, "__all__"), k == STEPS - 1)
 
 
+@pytest.mark.slow
 def test_an_agent_of_jaxmarl_is_done_until_the_next_episode(env):
     agents = jaxmarl.wrap(env)
     key = jax.random.key(0)

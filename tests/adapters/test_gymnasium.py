@@ -184,6 +184,7 @@ def test_the_next_episode_begins_in_the_step_in_which_one_ends(vector_of):
     assert len(np.unique(rows, axis=0)) == len(rows)  # every episode of every world begins anew
 
 
+@pytest.mark.slow
 def test_only_worlds_whose_episode_ended_are_masked(vector_of):
     envs = vector_of()
     envs.reset(seed=0)

@@ -262,6 +262,7 @@ def test_the_tension_is_that_of_the_formula_and_continuous_where_the_cable_becom
     np.testing.assert_allclose(c, 2 * 0.3 * np.sqrt(k * mu), rtol=1e-5)
 
 
+@pytest.mark.slow
 @shared_or_not
 def test_gradients_through_the_cables_are_those_of_central_differences(shared):
     params = jd.with_payload(team(3), MASS, 0.4, anchor=(0.005, 0, -0.01), cables=3 if shared else 1)
@@ -301,6 +302,7 @@ def test_the_gradient_is_finite_for_a_load_at_its_anchor_and_at_the_end_of_a_sla
     assert np.all(np.isfinite([gradient(x) for x in (0.0, 0.5, 0.6)]))
 
 
+@pytest.mark.slow
 @shared_or_not
 def test_many_worlds_swing_as_one_does(shared):
     params = jd.with_payload(team(3), MASS, 0.4, cables=3 if shared else 1)

@@ -26,6 +26,7 @@ assert (again.reset(key)[0] == env.reset(key)[0]).all()
 """
 
 
+@pytest.mark.slow
 def test_an_environment_pickles_and_needs_no_gymnasium():
     """In a process of its own: types are not checked there, and what checks them does not pickle."""
     environ = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}

@@ -46,7 +46,7 @@ def test_a_function_in_javascript_has_the_values_of_jax():
         x[seed % 3] = (y[seed % 3], 0.0, 0.5, y[seed % 3])[seed % 4]  # where branches meet
         y[(seed + 1) % 3] = 1.0
         found = in_node(f"(() => {{ {text}\nconst out = []; f(out, a, b); return out; }})()", x.tolist(), y.tolist())
-        expected = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(function(x, y))])
+        expected = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(jax.jit(function)(x, y))])
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
 
 

@@ -86,6 +86,7 @@ def test_constant_rotor_speeds_have_no_delay(delay):
     np.testing.assert_allclose(_shifted(jnp.full((40, 4), 2e4), jnp.array(delay)), 2e4, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
     """Validation flights choose a round and move no estimate; the start is 17 % off."""
     for estimate in fits:
@@ -93,6 +94,7 @@ def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
         assert estimate.identifiable
 
 
+@pytest.mark.slow
 def test_standard_errors_fall_with_the_root_of_the_number_of_flights(fits):
     one, two, _ = fits
     assert two.std_error / one.std_error == pytest.approx(2**-0.5, rel=0.05)

@@ -197,6 +197,7 @@ for episodes in (6, 3):
 """
 
 
+@pytest.mark.slow
 def test_devices_that_share_the_episodes_report_what_one_reports():
     done = subprocess.run([sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

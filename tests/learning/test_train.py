@@ -54,7 +54,7 @@ class Remember(nn.Module):
 OWN = {"nnx": NnxNetwork, "equinox": equinox_network}
 
 
-@pytest.mark.parametrize("library", OWN)
+@pytest.mark.parametrize("library", mostly_slow(OWN, ["equinox"]))
 def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
     """The gradient of a flight of the double integrator, of the same weights; that of flax linen is the reference."""
     params = MLP(SIZES[1:2], SIZES[2]).init(KEY, jnp.zeros(2))
@@ -72,6 +72,7 @@ def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
     np.testing.assert_allclose(entries(mine.policy.params), entries(theirs.policy.params), atol=1e-5)  # a step is 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @EACH_LEARNER
 def test_an_own_recurrent_network_learns_and_is_saved(learner, tmp_path):

@@ -53,6 +53,7 @@ def test_a_wall_hides_another_one_a_millimeter_behind(others):
     np.testing.assert_array_equal(index, 1)
 
 
+@pytest.mark.slow
 def test_a_ball_looks_and_moves_the_same_beside_a_box():
     """Kinds are looked at one after the other, and with one solid the second place in a turn stays empty."""
     ball, box = Sphere(pos=(3.0, 0.5, 0.3), radius=1.0), Box(pos=(3.0, -1.5, 0.0), size=(1.0, 1.0, 1.0))

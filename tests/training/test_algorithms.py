@@ -39,6 +39,7 @@ def test_an_unknown_learner_names_the_closest_one():
         learner("pppo")
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_a_training_traces_its_update_once(monkeypatch):
     traced, update = [], bptt.update

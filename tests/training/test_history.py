@@ -34,6 +34,7 @@ def runs(tmp_path_factory):
         return train(folder / "kept", "--keep-history"), train(folder / "plain")
 
 
+@pytest.mark.slow
 def test_the_policy_of_every_evaluation_is_kept(runs):
     kept, _ = runs
     updates = [kept.sidecar_entry(name, "update") for name in kept.kept]
@@ -46,6 +47,7 @@ def test_the_policy_of_every_evaluation_is_kept(runs):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_training_learns_the_same_without_its_history_and_writes_nothing_more(runs):
     kept, plain = runs
     assert plain.kept == [] and not (plain.folder / "history").exists()
@@ -63,6 +65,7 @@ def test_a_continued_training_goes_on_keeping_and_a_replaced_one_begins_anew(run
     assert train(folder, "--overwrite").kept == []
 
 
+@pytest.mark.slow
 def test_the_flights_of_a_history_begin_alike(runs):
     run, _ = runs
     with run.recipe().env() as env:
@@ -73,6 +76,7 @@ def test_the_flights_of_a_history_begin_alike(runs):
         np.testing.assert_allclose(policy.flight.drones.pos[0], evaluated[0].flight.drones.pos[0], atol=0.02)  # a step
 
 
+@pytest.mark.slow
 def test_a_run_without_history_is_refused_in_one_line(runs, capsys):
     assert main(["view", str(runs[1].folder), "--history"]) == 2
     assert "train with --keep-history" in capsys.readouterr().err

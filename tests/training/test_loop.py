@@ -57,6 +57,7 @@ def numbers(run):
     return rows, files, run.report()["evaluation"], run.report()["best_update"]
 
 
+@pytest.mark.slow
 def test_a_training_that_is_killed_twice_has_the_numbers_of_one_that_was_not(trainer, whole, tmp_path):
     run = Run(tmp_path)
     for call in (4, 2):

@@ -92,6 +92,7 @@ def test_the_clock_goes(record, lens):
     assert all(np.abs(a - b).max() > 100 for a, b in itertools.pairwise(corner))
 
 
+@pytest.mark.slow
 def test_drones_cast_shadows_on_the_ground(record):
     """Where the shadow of a drone falls it is darker than in other frames, unless something is drawn over it."""
     size = (SIZE[0] // 2, SIZE[1] // 2)

@@ -18,3 +18,8 @@ def make_simulation(n=2, hz=HZ, **options):
 
 def team_step(hz=HZ):
     return make_step((jd.ground_contact,), dt=1 / (hz * SUBSTEPS), substeps=SUBSTEPS)
+
+
+def nanoseconds(time):
+    """Time of a message, ns."""
+    return time.sec * 1_000_000_000 + time.nanosec

@@ -26,21 +26,6 @@ class Recorded(NamedTuple):
     message: msg.Message
 
 
-def serialize(message: msg.Message) -> bytes:
-    """Encode a message as CDR, little-endian, with its header of four bytes."""
-    store = msg.typestore()
-
-    def array(field: msg.Field, given: Any) -> np.ndarray:
-        return np.frombuffer(given, np.uint8) if field.kind == "uint8" else np.array(given, field.kind)
-
-    return bytes(store.serialize_cdr(msg.encode(message, store.types.__getitem__, array), message.NAME))
-
-
-def deserialize(data: bytes, name: str) -> msg.Message:
-    """Decode a message of the type `name` from CDR."""
-    return msg.decode(name, msg.typestore().deserialize_cdr(data, name))
-
-
 class Recorder(contextlib.AbstractContextManager["Recorder"]):
     """Writer of messages to a new bag; a context manager that finishes it."""
 
@@ -68,7 +53,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
             self._connections[topic.name] = self._writer.add_connection(
                 f"/{topic.name}", topic.type, typestore=msg.typestore()
             )
-        self._writer.write(self._connections[topic.name], ns, serialize(message))
+        self._writer.write(self._connections[topic.name], ns, msg.serialize(message))
 
     def close(self) -> None:
         """Finish the bag."""
@@ -84,7 +69,8 @@ def read(path: Path) -> Iterator[Recorded]:
         with Reader(path) as reader:
             known = [connection for connection in reader.connections if connection.msgtype in msg.MESSAGES]
             for connection, ns, data in reader.messages(known):
-                yield Recorded(connection.topic.removeprefix("/"), ns, deserialize(data, connection.msgtype))
+                message = msg.deserialize(data, connection.msgtype)
+                yield Recorded(connection.topic.removeprefix("/"), ns, message)
     except Exception as error:  # the reader raises errors of any type on damaged bytes
         raise UserError(f"{path} is not a ROS 2 bag, or is damaged: {error}; give the folder of a bag") from None
 

@@ -39,11 +39,6 @@ def stamp(ns: int) -> msg.Time:
     return msg.Time(*divmod(ns, _NS))
 
 
-def nanoseconds(time: msg.Time) -> int:
-    """Time of a message, ns."""
-    return time.sec * _NS + time.nanosec
-
-
 def state_messages(now: Measurement, i: int, ns: int) -> dict[str, msg.Message]:
     """Messages of drone `i` at the simulated time `ns`, by the names of `topics.OUTPUTS`, without images.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,19 +35,10 @@ _PLACES = ((1, -1), (-1, -1), (-1, 1), (1, 1))  # signs of x and y of the motors
 _CLOCK_DEPTH = 10
 
 
-class SwarmState(Protocol):
-    """`crazyflie_sim.sim_data_types.State`: position, velocity (world), quaternion (w, x, y, z), rates (body)."""
-
-    pos: Any
-    vel: Any
-    quat: Any
-    omega: Any
-
-
-class SwarmAction(Protocol):
-    """`crazyflie_sim.sim_data_types.Action`: speeds of the motors m1 to m4, RPM."""
-
-    rpm: Any
+SwarmState = Any
+"""`crazyflie_sim.sim_data_types.State`: pos, vel (world), quat (w, x, y, z), omega (body)."""
+SwarmAction = Any
+"""`crazyflie_sim.sim_data_types.Action`: rpm, the speeds of the motors m1 to m4, RPM."""
 
 
 class Backend:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxdrones.errors import install
 
@@ -105,21 +106,28 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(name)
 
 
-def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
-    """Convert a message to a class of another library.
-
-    `class_of` is a function from the name of a message type to that class, with the fields as keywords; `array` one
-    from a field and a tuple or bytes to an array of the other library.
-    """
-    own = fields(message.NAME)
-    return class_of(message.NAME)(**{f.name: _encode(f, getattr(message, f.name), class_of, array) for f in own})
+def serialize(message: Message) -> bytes:
+    """Encode a message as CDR, little-endian, with its header of four bytes."""
+    return bytes(typestore().serialize_cdr(_encode(message), message.NAME))
 
 
-def _encode(field: Field, value: Any, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
-    if field.is_message:
-        one = field.length is None
-        return encode(value, class_of, array) if one else [encode(x, class_of, array) for x in value]
-    return value if field.length is None else array(field, value)
+def deserialize(data: bytes, name: str) -> Message:
+    """Decode a message of the type `name` from CDR."""
+    return decode(name, typestore().deserialize_cdr(data, name))
+
+
+def _encode(message: Message) -> Any:
+    """Convert a message to a class of rosbags."""
+
+    def encoded(field: Field, value: Any) -> Any:
+        if field.is_message:
+            return _encode(value) if field.length is None else [_encode(x) for x in value]
+        if field.length is None:
+            return value
+        return np.frombuffer(value, np.uint8) if field.kind == "uint8" else np.array(value, field.kind)
+
+    values = {field.name: encoded(field, getattr(message, field.name)) for field in fields(message.NAME)}
+    return typestore().types[message.NAME](**values)
 
 
 def decode(name: str, foreign: Any) -> Message:

@@ -98,11 +98,7 @@ class Node:
                 transport.subscribe(topic, functools.partial(self._receive, i, name, topic))
         if lockstep:
             transport.serve(topics.STEP_SERVICE, self._answer)
-        now = clock()
-        self._watches = [Watch(self._failsafe, now) for _ in range(simulation.drones)]
-        self._stepper = Watch(self._failsafe, now)
         self._said: set[Hashable] = set()
-        self._due = now
 
     def run(self, duration: float | None = None) -> Flown:
         """Fly until the simulated time `duration` (s), by default forever, or until all drones have landed.
@@ -112,7 +108,7 @@ class Node:
         """
         steps = None if duration is None else round(duration * self._flight.control_hz)
         now = self._clock()
-        self._watches = [Watch(self._failsafe, now) for _ in self._watches]
+        self._watches = [Watch(self._failsafe, now) for _ in range(self._flight.drones)]
         self._stepper, self._due = Watch(self._failsafe, now), now
         self._publish()
         try:

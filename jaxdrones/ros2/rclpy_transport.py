@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import importlib
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +23,6 @@ from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.topics import QoS, Topic
 from jaxdrones.ros2.transport import Answer
 
-_TYPECODES = {"uint8": "B", "float32": "f", "float64": "d"}
 _LOOK = 1.0  # s between checks of the other endpoints
 
 
@@ -50,13 +48,13 @@ class RclpyTransport:
         publisher = self._node.create_publisher(ros_class(topic.type), f"/{topic.name}", _ros_qos(topic.qos))
         self._publishers.append(publisher)
         self._topics.append((topic, True))
-        return lambda message: publisher.publish(to_ros(message))
+        return lambda message: publisher.publish(msg.serialize(message))
 
     def subscribe(self, topic: Topic, receive: Callable[[Any], None]) -> None:
         """Call a function with every message of a topic."""
 
         def received(message: Any) -> None:
-            receive(from_ros(topic.type, message))
+            receive(msg.decode(topic.type, message))
 
         qos = _ros_qos(topic.qos)
         end = self._node.create_subscription(ros_class(topic.type), f"/{topic.name}", received, qos)
@@ -135,21 +133,6 @@ def ros_class(kind: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError as error:
         raise ImportError(f"{kind} is not installed; install the ROS 2 package {package}") from error
-
-
-def to_ros(message: msg.Message) -> Any:
-    """Convert a message to the installed ROS 2."""
-    return msg.encode(message, ros_class, _ros_array)
-
-
-def from_ros(kind: str, message: Any) -> msg.Message:
-    """Convert a message of the installed ROS 2 of the type `kind`."""
-    return msg.decode(kind, message)
-
-
-def _ros_array(field: msg.Field, given: Any) -> Any:
-    """Array of numbers for rclpy: a list for a fixed length, else an `array.array`."""
-    return list(given) if field.length else array.array(_TYPECODES[field.kind], given)
 
 
 def _ros_qos(qos: QoS) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import assert_close
 from in_process import InProcess, Peer, Wire, positions
-from ros2_team import HZ, make_simulation, team_step
+from ros2_team import HZ, make_simulation, nanoseconds, team_step
 
 from jaxdrones.errors import UserError
 from jaxdrones.ros2 import Failsafe, Node, PeerLost, convert, topics
@@ -28,12 +28,12 @@ def test_every_step_is_published_once_for_every_drone():
     wire = Wire()
     node, _ = make_node(wire)
     flown = node.run(0.2)
-    stamps = [convert.nanoseconds(message.clock) for message in wire.sent["clock"]]
+    stamps = [nanoseconds(message.clock) for message in wire.sent["clock"]]
     assert stamps == [k * 10_000_000 for k in range(21)]
     for i in range(2):
         for name in ("pose", "twist", "odom", "imu"):
             sent = wire.sent[topics.output(i, name).name]
-            assert [convert.nanoseconds(message.header.stamp) for message in sent] == stamps
+            assert [nanoseconds(message.header.stamp) for message in sent] == stamps
     assert flown.steps == 20 and flown.published == sum(map(len, wire.sent.values())) and flown.late == 0
 
 
@@ -195,7 +195,7 @@ def test_images_come_at_the_rate_of_the_camera():
     wire = Wire()
     node, _ = make_node(wire, camera=Camera(resolution=(8, 6), rate=25.0))
     node.run(0.2)
-    stamps = [convert.nanoseconds(m.header.stamp) for m in wire.sent["drone_1/camera/image_raw"]]
+    stamps = [nanoseconds(m.header.stamp) for m in wire.sent["drone_1/camera/image_raw"]]
     assert stamps == [k * 40_000_000 for k in range(6)]
     assert len(wire.sent["drone_1/camera/camera_info"]) == 6
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ros2_team import HZ, make_simulation
+from ros2_team import HZ, make_simulation, nanoseconds
 
 from jaxdrones.ros2 import Failsafe, Node, QoS, Topic, convert, topics
 from jaxdrones.ros2 import messages as msg
@@ -202,7 +202,7 @@ class Commander:
         return count
 
     def times(self, i):
-        return [convert.nanoseconds(message.header.stamp) for message in self.odom[i]]
+        return [nanoseconds(message.header.stamp) for message in self.odom[i]]
 
     def at(self, pos):
         now = [convert.numbers(seen[-1].pose.pose.position) for seen in self.odom]

@@ -5,8 +5,7 @@ import threading
 import urllib.request
 
 import numpy as np
-
-from jaxdrones.visualization.viewer.payload import decode
+from viewer_payload import decode
 
 ARRAYS = ("t", "pos", "quat", "vel", "omega", "rpm")
 

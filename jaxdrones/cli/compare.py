@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxdrones.cli.common import check_writable
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
-from jaxdrones.cli.options import add_no_figure, add_output
+from jaxdrones.cli.options import add_no_figure, add_output, split_names
 from jaxdrones.cli.report import print_results, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -91,7 +91,7 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
 
 
 def _names(option: str, text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
+    names = split_names(text)
     if len(set(names)) < len(names):
         raise UserError(f"--{option} is {text!r}; give two different ones, or more")
     return names

@@ -20,6 +20,9 @@ _KINDS = {  # argument -> kind of its names
     "rotors": "rotors",
     "integrator": "integrators",
     "algo": "algorithms",
+    "shell": "shells",
+    "realistic": "kinds",
+    "to": "targets",
 }
 _FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
 
@@ -44,15 +47,9 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
         import shtab
     except ImportError:
         raise UserError(f"shtab is not installed; {install('cli')}") from None
-    names = known_names()
+    names = known_names() | {"shells": SHELLS, "kinds": REALISTIC_KINDS, "targets": TARGETS}
     for action in _actions(root):
-        if action.dest == "shell":
-            action.choices = SHELLS
-        elif action.dest == "realistic":
-            action.choices = REALISTIC_KINDS
-        elif action.dest == "to":
-            action.choices = TARGETS
-        elif action.dest in _KINDS:
+        if action.dest in _KINDS:
             action.choices = names[_KINDS[action.dest]]
         elif action.metavar in (*_FOLDERS, *_FILES):
             vars(action)["complete"] = shtab.DIRECTORY if action.metavar in _FOLDERS else shtab.FILE

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.cli.common import check_writable, folder, print_warning
-from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle
+from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle, split_names
 from jaxdrones.cli.report import print_results
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
@@ -58,7 +58,7 @@ def add(commands) -> None:
 def _fit(options: argparse.Namespace) -> int:
     params = load_params(options.vehicle)
     motors, gains = crazyflie_motors(options.propellers), firmware_pid.gains(propellers=options.propellers)
-    names = [name.strip() for name in (options.parameters or "").split(",") if name.strip()]
+    names = split_names(options.parameters) if options.parameters else []
     check_no_fit(options.output)
     check_writable(options.output / REPORT)
     logs = load_logs([*options.logs, *options.validate], options.allow_inconsistent)

@@ -5,12 +5,15 @@ import contextlib
 from typing import Any
 
 from jaxdrones.cli.common import bar, print_error
-from jaxdrones.cli.options import add_drones, add_vehicle
+from jaxdrones.cli.options import add_drones, add_vehicle, split_names
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.urdf import load_params
+
+CONDITIONS = ("effects", "controller", "feedforward", "control_hz", "duration", "rotors", "integrator")
+"""Options of an example; with a policy they are those of its task."""
 
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
@@ -54,8 +57,9 @@ def check_conditions(options: argparse.Namespace, **more) -> None:
 
 
 def _conditions(options: argparse.Namespace) -> dict[str, Any]:
-    names = ("vehicle", "drones", "controller", "feedforward", "control_hz", "duration", "rotors", "integrator", "seed")
-    return {name: getattr(options, name) for name in names} | {"effects": _names(options.effects)}
+    given = {name: getattr(options, name) for name in ("vehicle", "drones", "seed", *CONDITIONS)}
+    effects = [] if options.effects == "none" else options.effects and split_names(options.effects)
+    return given | {"effects": effects}
 
 
 def warn(diverged: dict[str, str]) -> int:
@@ -65,12 +69,6 @@ def warn(diverged: dict[str, str]) -> int:
     others = f" (and {len(diverged) - 1} more)" if len(diverged) > 1 else ""
     what = f"the flight diverged: {next(iter(diverged.values()))}{others}"
     return print_error(f"{what}; try a higher --control-hz, another --controller, or fewer --effects", 1)
-
-
-def _names(text: str | None) -> list[str] | None:
-    if text is None:
-        return None
-    return [] if text == "none" else [name.strip() for name in text.split(",")]
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ import jax
 
 from jaxdrones import arguments
 from jaxdrones.cli.common import check_writable, folder, print_error
-from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
+from jaxdrones.cli.flight_options import CONDITIONS, add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
@@ -27,17 +27,6 @@ from jaxdrones.training.episode import fly_episode, to_record
 from jaxdrones.visualization import films, paths, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
-_OF_EXAMPLES = (
-    "effects",
-    "controller",
-    "feedforward",
-    "control_hz",
-    "duration",
-    "rotors",
-    "integrator",
-    "obstacles",
-    "gui",
-)
 
 
 def add(commands) -> None:
@@ -112,16 +101,13 @@ def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Non
     if options.renderer is not None and options.video is None:
         raise UserError(f"--renderer {options.renderer} is given without --video FILE; give both or none")
     if options.policy is None:
-        if options.set:
-            raise UserError(f"--set {options.set[0]} is given without --policy file.py:name; give both or none")
-        if options.task is not None:
-            raise UserError(f"--task {options.task} is given without --policy file.py:name; leave it out, or give both")
-        if options.realistic:
-            raise UserError("--realistic is given without --policy file.py:name; leave it out, or give both")
+        given = {f"--set {x}": x for x in options.set[:1]} | {f"--task {options.task}": options.task}
+        for name, x in (given | {"--realistic": options.realistic}).items():
+            if x:
+                raise UserError(f"{name} is given without --policy file.py:name; leave it out, or give both")
         return
     own = is_user_policy(options.policy)
-    names = ["flight", *([] if own else ["vehicle"]), *_OF_EXAMPLES]
-    for name in names:
+    for name in ("flight", *([] if own else ["vehicle"]), *CONDITIONS, "obstacles", "gui"):
         if getattr(options, name) != parser.get_default(name):
             what = "the task" if own else "the run"
             raise UserError(f"{name} {getattr(options, name)} is given beside --policy; {what} determines it")

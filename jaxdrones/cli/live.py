@@ -12,6 +12,8 @@ from jaxdrones.cli.report import percent
 from jaxdrones.training.episode import fly_episode
 from jaxdrones.visualization.viewer.live import Live
 
+Progress = Callable[[int, dict[str, float]], None]
+
 WAIT = 60.0
 """Wait of a flight for the first viewer, s."""
 
@@ -37,26 +39,21 @@ def live_server(port: int | None, quiet: bool, title: str | None = None) -> Iter
         yield live
 
 
-class LiveTraining:
-    """Live view of a training: learning curve and an episode of the newest policy after every evaluation."""
+def show_training(live: Live, trainer: Any, run: Any, what: str, then: Progress) -> Progress:
+    """Progress of a training that shows its curve and an episode of the newest policy after every evaluation.
 
-    def __init__(self, live: Live, trainer: Any, run: Any, what: str, then: Callable[[int, dict[str, float]], None]):
-        """Prepare, without a flight; `what` is the title, and `then` receives the progress afterwards."""
-        self._live, self._trainer, self._run, self._what = live, trainer, run, what
-        self._then = then
-        self._name = "success" if trainer.env.task.success is not None else "return"
-        self._curve: list[tuple[float, float]] = []
+    `what` is the title, and `then` receives the progress afterwards.
+    """
+    env, curve = trainer.env, []
+    name = "success" if env.task.success is not None else "return"
 
-    def update(self, count: int, now: dict[str, float]) -> None:
-        """Forward the progress; fly and show an episode after an evaluation."""
+    def update(count: int, now: dict[str, float]) -> None:
         if "evaluated_return" in now:
-            self._show(count, now)
-        self._then(count, now)
+            score = now["success" if name == "success" else "evaluated_return"]
+            curve.append((count, score))
+            result = percent(score, trainer.episodes) if name == "success" else f"{score:.1f}"
+            title = f"{what}, update {count} of {trainer.recipe.config.updates}: {name} {result}"
+            live.show(fly_episode(env, run.policy("last", env), jax.random.key(0)), title, curve, name)
+        then(count, now)
 
-    def _show(self, count: int, now: dict[str, float]) -> None:
-        env, score = self._trainer.env, now["success" if self._name == "success" else "evaluated_return"]
-        self._curve.append((count, score))
-        episode = fly_episode(env, self._run.policy("last", env), jax.random.key(0))
-        result = percent(score, self._trainer.episodes) if self._name == "success" else f"{score:.1f}"
-        title = f"{self._what}, update {count} of {self._trainer.recipe.config.updates}: {self._name} {result}"
-        self._live.show(episode, title, self._curve, self._name)
+    return update

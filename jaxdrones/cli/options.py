@@ -4,6 +4,7 @@ from pathlib import Path
 
 from jaxdrones import assets
 from jaxdrones.cli.common import folder
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 
 
@@ -37,3 +38,16 @@ def add_output(group, text: str, default: Path | None = None, metavar: str = "DI
 def add_no_figure(group) -> None:
     """Add --no-figure."""
     group.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
+
+
+def split_names(text: str) -> list[str]:
+    """Names of an option `A,B`."""
+    return [name.strip() for name in text.split(",")]
+
+
+def parse_pixels(option: str, text: str, example: str) -> tuple[int, int]:
+    """Width and height of an option `WxH`, pixels."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise UserError(f"{option} is {text!r}; give width and height in pixels, for example {example}")
+    return int(width), int(height)

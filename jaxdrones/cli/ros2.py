@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
 from jaxdrones.cli.common import folder, print_error, print_warning, until_interrupted
-from jaxdrones.cli.options import add_backend, add_drones, add_vehicle
+from jaxdrones.cli.options import add_backend, add_drones, add_vehicle, parse_pixels
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
@@ -125,10 +125,7 @@ def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Sim
 def _camera(options: argparse.Namespace) -> Camera | None:
     if options.camera is None:
         return None
-    width, _, height = options.camera.partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise UserError(f"--camera is {options.camera!r}; give width and height in pixels, for example 64x48")
-    return Camera(resolution=(int(width), int(height)), rate=options.camera_hz)
+    return Camera(resolution=parse_pixels("--camera", options.camera, "64x48"), rate=options.camera_hz)
 
 
 def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:

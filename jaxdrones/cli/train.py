@@ -13,7 +13,7 @@ from typing import Any
 from jaxdrones import arguments
 from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
-from jaxdrones.cli.live import LiveTraining, add_live, live_server
+from jaxdrones.cli.live import add_live, live_server, show_training
 from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle
 from jaxdrones.cli.report import described
@@ -200,10 +200,10 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
         for seed, run in remaining(runs, config.updates, request.seconds).items():
             label = f"seed {seed}" if len(runs) > 1 else "training"
             display = train_output.ProgressDisplay(_updates(request, config), label, trainer.episodes, print_line)
-            on_progress = display.update
+            on_progress: Callable = display.update
             if live:
                 title = what + f", seed {seed}" * (len(runs) > 1)
-                on_progress = LiveTraining(live, trainer, run, title, on_progress).update
+                on_progress = show_training(live, trainer, run, title, on_progress)
             try:
                 with display:
                     loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed], request.keep_history)

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice, whole
 from jaxdrones.cli.common import check_writable, folder
-from jaxdrones.cli.options import add_output
+from jaxdrones.cli.options import add_output, parse_pixels
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
@@ -56,7 +56,9 @@ def add(commands) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
-    options.size = _size(options.size)
+    options.size = parse_pixels("--size", options.size, "1280x720")
+    if any(pixels % 2 for pixels in options.size):
+        raise UserError(f"--size is {options.size}; give two even numbers of pixels, for example 1280x720")
     if options.video:
         video.check_video(options.video)
     if options.history:
@@ -119,10 +121,3 @@ def _is_flight(path: Path) -> bool:
             return "pos.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return log.is_dir() or log.suffix in (".npz", ".csv")
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()) or int(width) % 2 or int(height) % 2:
-        raise UserError(f"size of the film is {text!r}; give two even numbers of pixels, for example 1280x720")
-    return int(width), int(height)

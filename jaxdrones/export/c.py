@@ -1,7 +1,5 @@
 """Policies as a C99 header without memory allocation, for a flight controller."""
 
-import re
-
 from jaxdrones.export.calls import Call, Program, Span
 from jaxdrones.export.layers import Graph, Tensor
 from jaxdrones.export.text import Description, block_comment, number, numbers
@@ -165,8 +163,7 @@ def header(graph: Graph, program: Program, description: Description, name: str =
 
 
 def _usage(graph: Graph, name: str) -> list[str]:
-    arguments = ", ".join(["hidden" if x.name == "hidden_state" else x.name for x in graph.inputs] + ["act"])
-    lines = [f"float act[{name.upper()}_ACT_SIZE];", f"{name}_step({arguments});"]
+    lines = [f"float act[{name.upper()}_ACT_SIZE];", f"{name}_step({', '.join([*graph.arguments, 'act'])});"]
     if graph.hidden_size:
         hidden = [f"float hidden[{name.upper()}_HIDDEN_SIZE];", f"{name}_reset(hidden); /* before each flight */"]
         lines = [*hidden, *lines]
@@ -210,8 +207,3 @@ def _text(call: Call, name: str) -> str:
         return str(x)
 
     return f"{name}_{call.function}({', '.join(map(argument, call.arguments))});"
-
-
-def is_identifier(name: str) -> bool:
-    """Whether a name can be the prefix of names in C."""
-    return re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) is not None

@@ -13,8 +13,6 @@ from jaxdrones.export import layers
 from jaxdrones.export.layers import Graph, Layer, Tensor
 from jaxdrones.learning.layers import FADE, SMALL_SQUARE
 
-_BYTES = 4  # of a number
-
 
 @dataclasses.dataclass(frozen=True)
 class Span:
@@ -49,7 +47,7 @@ class Program:
     @property
     def ram(self) -> int:
         """Bytes of working memory and hidden state."""
-        return _BYTES * (self.work_size + self.hidden_size)
+        return layers.BYTES * (self.work_size + self.hidden_size)
 
 
 def program_of(graph: Graph) -> Program:

@@ -17,7 +17,7 @@ from jaxdrones.envs import Env, explain
 from jaxdrones.errors import UserError
 from jaxdrones.export import c, js, onnx, stablehlo
 from jaxdrones.export.calls import program_of
-from jaxdrones.export.layers import Graph, Tensor
+from jaxdrones.export.layers import Tensor
 from jaxdrones.export.network import layers_of
 from jaxdrones.export.text import Description
 from jaxdrones.learning.networks import Policy
@@ -65,7 +65,7 @@ def save(
         ValueError: an unknown target, a policy that it cannot express, or a missing library.
         OSError: a file that cannot be written.
     """
-    if not c.is_identifier(name):
+    if not (name.isidentifier() and name.isascii() and name[0] != "_"):
         raise UserError(f"name is {name!r}; give a letter, then letters, digits and underscores")
     if not isinstance(policy, Policy):
         raise UserError(
@@ -96,18 +96,9 @@ def save(
         for file, content in contents.items():
             writing.write(folder / file, content)
         files = tuple(folder / file for file in contents)
-        results.append(Exported(files, description.multiply_adds, description.flash, description.ram))
+        multiply_adds = None if description.graph is None else description.graph.multiply_adds
+        results.append(Exported(files, multiply_adds, description.flash, description.ram))
     return results
-
-
-def _with_costs(description: Description, graph: Graph, ram: int | None = None) -> Description:
-    return dataclasses.replace(
-        description,
-        hidden_size=graph.hidden_size,
-        multiply_adds=graph.multiply_adds,
-        flash=graph.weight_bytes,
-        ram=ram,
-    )
 
 
 def _contents(
@@ -116,14 +107,14 @@ def _contents(
     """Files of the policy of one drone, and its description with its costs."""
     if to == "stablehlo":
         with contextlib.suppress(UserError):  # unknown layers, whose costs are unknown too
-            description = _with_costs(description, layers_of(policy, images))
+            description = dataclasses.replace(description, graph=layers_of(policy, images))
         about = json.dumps(description.as_dict(), indent=2)
         return {f"{name}.stablehlo": stablehlo.program(policy, images), f"{name}.json": about.encode()}, description
     graph = layers_of(policy, images)
+    description = dataclasses.replace(description, graph=graph)
     if to == "onnx":
-        description = _with_costs(description, graph)
         return {f"{name}.onnx": onnx.model(graph, description)}, description
     program = program_of(graph)
-    description = _with_costs(description, graph, program.ram)
+    description = dataclasses.replace(description, ram=program.ram)
     text = (c.header if to == "c" else js.module)(graph, program, description, name)
     return {f"{name}.{'h' if to == 'c' else 'js'}": text.encode()}, description

@@ -133,17 +133,13 @@ def module(graph: Graph, program: Program, description: Description, name: str =
     return "\n\n".join(parts) + "\n"
 
 
-def _argument_names(graph: Graph) -> list[str]:
-    return ["hidden" if x.name == "hidden_state" else x.name for x in graph.inputs]
-
-
 def _usage(graph: Graph, name: str) -> list[str]:
     names = ["step", *(["initialHiddenState"] if graph.hidden_size else [])]
     hidden = ["const hidden = initialHiddenState(); // before each flight"] if graph.hidden_size else []
     lines = [
         f'import {{ {", ".join(names)} }} from "./{name}.js";',
         *hidden,
-        f"const act = step({', '.join(_argument_names(graph))});",
+        f"const act = step({', '.join(graph.arguments)});",
     ]
     return ["To use it:", "", *(f"    {line}" for line in lines)]
 
@@ -156,10 +152,9 @@ export function initialHiddenState() {{
 
 
 def _step(graph: Graph, program: Program) -> str:
-    arguments = _argument_names(graph)
     checks = [
         f"if ({name}.length !== {x.size}) throw new RangeError(`{name} has ${{{name}.length}} numbers, not {x.size}`);"
-        for name, x in zip(arguments, graph.inputs, strict=True)
+        for name, x in zip(graph.arguments, graph.inputs, strict=True)
     ]
     lines = [
         *checks,
@@ -169,7 +164,7 @@ def _step(graph: Graph, program: Program) -> str:
     ]
     about = "// Action of an observation" + ("; updates the hidden state." if graph.hidden_size else ".")
     body = "\n".join(f"  {line}" for line in lines)
-    return f"{about}\nexport function step({', '.join(arguments)}) {{\n{body}\n}}"
+    return f"{about}\nexport function step({', '.join(graph.arguments)}) {{\n{body}\n}}"
 
 
 def _view(span: Span) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxdrones.learning.normalize import CLIP
 
-_BYTES = 4  # of a weight, float32
+BYTES = 4
+"""Of a weight or another number, float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Layer:
     @property
     def multiply_adds(self) -> int:
         """Number of products that are added up."""
-        return 0
+        return self.output.size * len(self.constants["kernel"]) if "kernel" in self.constants else 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,10 +61,6 @@ class Dense(Layer):
         """Number of rows; 1 of a vector."""
         return math.prod(self.output.shape[:-1])
 
-    @property
-    def multiply_adds(self) -> int:  # noqa: D102
-        return self.rows * self.constants["kernel"].size
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Convolution(Layer):
@@ -79,11 +76,6 @@ class Convolution(Layer):
         """Rows of zeros above and below, columns of zeros left and right."""
         rows, columns = (-size % self.stride for size in self.inputs[0].shape[:2])
         return (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2)
-
-    @property
-    def multiply_adds(self) -> int:  # noqa: D102
-        rows, columns, _ = self.output.shape
-        return rows * columns * self.constants["kernel"].size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -178,6 +170,6 @@ class Graph:
         return sum(x.size for layer in self.layers for x in layer.constants.values())
 
     @property
-    def weight_bytes(self) -> int:
-        """Bytes of all weights."""
-        return _BYTES * self.weights
+    def arguments(self) -> list[str]:
+        """Names of the inputs in C and JavaScript."""
+        return ["hidden" if x.name == "hidden_state" else x.name for x in self.inputs]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.envs.explanation import Explanation, entries_table
+from jaxdrones.export.layers import BYTES, Graph
 
 WIDTH = 120
 
@@ -21,14 +22,20 @@ class Description:
     """Of the environment of the policy."""
     period: float
     """Time between two calls, s."""
-    hidden_size: int = 0
-    """Length of the hidden state of a recurrent policy; 0 without one, and for a network of unknown layers."""
-    multiply_adds: int | None = None
-    """Of one call; `None` for a network of unknown layers."""
-    flash: int | None = None
-    """Bytes of the weights."""
+    graph: Graph | None = None
+    """Layers of the policy; `None` for a network of unknown layers."""
     ram: int | None = None
     """Bytes of working memory and hidden state, of targets that manage their own memory."""
+
+    @property
+    def flash(self) -> int | None:
+        """Bytes of the weights; `None` for unknown layers."""
+        return None if self.graph is None else BYTES * self.graph.weights
+
+    @property
+    def hidden_size(self) -> int:
+        """Length of the hidden state of a recurrent policy; 0 without one, and for unknown layers."""
+        return 0 if self.graph is None else self.graph.hidden_size
 
     def lines(self) -> list[str]:
         """Text of inputs and outputs, one line per row of a table."""
@@ -36,9 +43,9 @@ class Description:
             f"{self.title}: deterministic policy of one drone, written by `jaxdrones export`.",
             f"Call it {1 / self.period:g} times per second.",
         ]
-        if self.multiply_adds is not None and self.flash is not None:
+        if self.graph is not None:
             ram = "" if self.ram is None else f", {self.ram:,} bytes of RAM (working memory and hidden state)"
-            text.append(f"One call: {self.multiply_adds:,} multiply-adds{ram}, {self.flash:,} bytes of weights.")
+            text.append(f"One call: {self.graph.multiply_adds:,} multiply-adds{ram}, {self.flash:,} bytes of weights.")
         text += ["", "Observation; clip values beyond the range:", *self._table("observation")]
         for name, meaning in self.explanation.images.items():
             text += ["", f"Image {name}, row by row: {meaning}"]

@@ -1,6 +1,6 @@
 """Films and on-board pictures of recorded flights, rendered by Bullet (extra `bullet`)."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -29,19 +29,14 @@ def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequen
 
     t, pictures = [], []
     with bullet.make_step(scene=record.scene) as step:
-        for frame, state in enumerate(_states(record, fps)):
-            rgb = step.camera(record.params, state, camera_2021).rgb
+        for frame, row in enumerate(rows_of_frames(record, fps)):
+            rgb = step.camera(record.params, _state(record, row), camera_2021).rgb
             for label, picture in zip(record.labels, rgb, strict=True):
                 (folder / label).mkdir(parents=True, exist_ok=True)
                 imsave(folder / label / f"{frame:05d}.png", picture)
             t.append(frame / fps)
             pictures.append(np.asarray(rgb))
     return ImageSequence(np.array(t), np.stack(pictures))
-
-
-def _states(record: FlightLog, fps: int) -> Iterator[State]:
-    """Recorded finite state nearest to every frame's time; at least one."""
-    return (_state(record, row) for row in rows_of_frames(record, fps))
 
 
 def _state(record: FlightLog, row: int) -> State:

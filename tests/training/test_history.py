@@ -9,12 +9,12 @@ import pytest
 from documents import ROOT
 from helpers import SMALL_OPTIONS
 from PIL import Image
+from viewer_payload import decode
 
 from jaxdrones.cli import main
 from jaxdrones.training.history import fly_history
 from jaxdrones.training.run import Run
 from jaxdrones.visualization import browser
-from jaxdrones.visualization.viewer.payload import decode
 
 SHORT = f"{' '.join(SMALL_OPTIONS)} --budget 4 --episodes 8 --no-figure"
 pytestmark = pytest.mark.float32

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from viewer_payload import decode
 
 import jaxdrones as jd
 from jaxdrones.training.episode import fly_episode
-from jaxdrones.visualization.viewer.payload import decode
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ import re
 import numpy as np
 import pytest
 from documents import ROOT
+from viewer_payload import decode
 
 from jaxdrones import assets
 from jaxdrones.cli import live, main
 from jaxdrones.visualization import browser
 from jaxdrones.visualization.viewer.gallery import read_exhibits
-from jaxdrones.visualization.viewer.payload import decode
 
 CHOSEN = "document.querySelector('[aria-current]')"
 OWN = """

@@ -14,6 +14,7 @@ import pytest
 from documents import ROOT
 from helpers import flying
 from live_viewer import same
+from viewer_payload import decode
 
 import jaxdrones as jd
 from jaxdrones.cli import main
@@ -23,7 +24,6 @@ from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
 from jaxdrones.visualization.viewer import show
-from jaxdrones.visualization.viewer.payload import decode
 from jaxdrones.visualization.viewer.show import records_of
 
 ARRAYS = ("pos", "quat", "vel", "omega", "rpm")

@@ -79,20 +79,11 @@ def _touching_each_other(log: FlightLog, row: np.ndarray, drone: np.ndarray) -> 
 
 def _close_pairs(row: np.ndarray, pos: np.ndarray, reach: float) -> np.ndarray:
     """(m, 2) indices of points (k, 3) of the same row that are closer than `reach` m; each pair once."""
-    widest = int(np.argmax(np.ptp(pos, axis=0)))
-    order = np.lexsort((pos[:, widest], row))
-    row, pos = row[order], pos[order]
-    pairs = [np.zeros((0, 2), int)]
-    first = np.arange(len(row))
-    for ahead in range(1, len(row)):  # neighbors along the axis, one further each time
-        first = first[first + ahead < len(row)]
-        apart = pos[first + ahead, widest] - pos[first, widest]
-        first = first[(row[first + ahead] == row[first]) & (apart < reach)]
-        if not len(first):
-            break
-        close = first[np.linalg.norm(pos[first + ahead] - pos[first], axis=1) < reach]
-        pairs.append(order[np.stack([close, close + ahead], axis=1)])
-    return np.concatenate(pairs)
+    from scipy.spatial import KDTree  # loading it takes a tenth of a second
+
+    finite = np.flatnonzero(np.isfinite(pos).all(axis=1))
+    apart = 2 * reach * row[finite, None]  # points of different rows are far apart along a fourth axis
+    return finite[KDTree(np.hstack([pos[finite], apart])).query_pairs(reach, output_type="ndarray")]
 
 
 def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:

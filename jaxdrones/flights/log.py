@@ -134,12 +134,13 @@ class FlightLog:
         """Drop of the battery voltage of the first drone from rest to take-off, V; 0 for a log that begins in flight.
 
         The voltage at rest is the highest one before the motors start; the voltage at take-off is the mean from 1.5 to
-        3.5 s after, at 100 rows per second.
+        3.5 s after, at 100 rows per second, or over the whole of a shorter flight.
         """
         begin, voltage = int(np.argmax(self.in_flight)), self.vbat[:, 0]
-        return (
-            float(np.max(voltage[:begin]) - np.mean(voltage[begin:][_TAKE_OFF])) if begin and self.has("vbat") else 0.0
-        )
+        if not (begin and self.has("vbat")):
+            return 0.0
+        flown = voltage[begin:]
+        return float(np.max(voltage[:begin]) - np.mean(flown[_TAKE_OFF] if len(flown) > _TAKE_OFF.start else flown))
 
     @functools.cached_property
     def rpy(self) -> np.ndarray:

@@ -64,6 +64,7 @@ def test_a_part_of_a_large_sag_does_not_reach_the_motors(flown):
     vehicle, (hovering, climbing) = flown
     log = log_of(0.05, TAKE_OFF)
     assert log.sag == pytest.approx(REST - LOADED)
+    assert log_of(0.05, ROWS - 100).sag == pytest.approx(REST - LOADED)  # a flight of one second
     assert log_of(HEIGHT, 0).sag == 0
     np.testing.assert_allclose(vehicle.instruments.motor_supply(jnp.array(LOADED), jnp.array(0.4)), LOADED)
     supply = LOADED + 0.5 * (log.sag - 0.55)

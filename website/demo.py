@@ -24,7 +24,7 @@ from jaxdrones.flights import load_flights, load_vehicle, simulate_closed_loop
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
 from jaxdrones.training.episode import fly_episode
 from jaxdrones.training.run import Run
-from jaxdrones.visualization.viewer.gallery import Exhibit
+from jaxdrones.visualization.viewer.page import Exhibit
 from jaxdrones.visualization.viewer.payload import encode
 from jaxdrones.visualization.viewer.show import records_of
 

@@ -16,8 +16,7 @@ import tasks
 from mkdocs.structure.files import File
 
 from jaxdrones import assets
-from jaxdrones.visualization.viewer.gallery import read_exhibits
-from jaxdrones.visualization.viewer.page import Page
+from jaxdrones.visualization.viewer.page import Page, read_exhibits
 
 ROOT = Path(__file__).parent.parent
 COPIED = {  # file of the repository -> page of the site

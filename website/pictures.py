@@ -18,8 +18,7 @@ import jaxdrones as jd
 from jaxdrones import assets
 from jaxdrones.envs import TASKS
 from jaxdrones.visualization.browser import open_tab
-from jaxdrones.visualization.viewer.gallery import read_exhibits
-from jaxdrones.visualization.viewer.page import Page
+from jaxdrones.visualization.viewer.page import Page, read_exhibits
 
 _SIZE = (640, 360)  # pixels
 _FPS, _LONGEST = 12, 6.0  # frames per second, and s, of a film

@@ -15,7 +15,7 @@ from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.errors import UserError
-from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
+from jaxdrones.visualization.viewer.page import Exhibit, gallery, read_exhibits
 from jaxdrones.writing import write
 
 _FIRST = "forest"

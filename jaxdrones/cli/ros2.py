@@ -21,7 +21,6 @@ from jaxdrones.ros2.command import CONTROLLERS
 from jaxdrones.ros2.failsafe import ACTIONS, Failsafe, PeerLost
 from jaxdrones.ros2.node import Node
 from jaxdrones.ros2.simulation import Simulation
-from jaxdrones.ros2.transport import Transport
 from jaxdrones.sensing import Camera
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
@@ -73,7 +72,7 @@ def add(commands) -> None:
     replay.set_defaults(run=functools.partial(_replay, parser), ranges=dict(speed=number(above=0)))
 
 
-def join() -> Transport:
+def join() -> topics.Transport:
     """Start a node of rclpy."""
     from jaxdrones.ros2.rclpy_transport import RclpyTransport  # optional
 
@@ -138,7 +137,7 @@ def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int
     return 0
 
 
-def _published(options: argparse.Namespace, transport: Transport) -> dict[str, Any]:
+def _published(options: argparse.Namespace, transport: topics.Transport) -> dict[str, Any]:
     known = {**topics.OUTPUTS, **topics.COMMANDS}
     publishers: dict[str, Any] = {}
     begin, published, ns = time.monotonic(), 0, 0

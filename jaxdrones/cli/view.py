@@ -17,9 +17,8 @@ from jaxdrones.flights.files import find_log
 from jaxdrones.training.history import fly_history
 from jaxdrones.visualization import video
 from jaxdrones.visualization.viewer.film import CAMERAS, film
-from jaxdrones.visualization.viewer.history import show_history
 from jaxdrones.visualization.viewer.page import Page
-from jaxdrones.visualization.viewer.show import LAYOUTS, show
+from jaxdrones.visualization.viewer.show import LAYOUTS, show, show_history
 
 
 def add(commands) -> None:

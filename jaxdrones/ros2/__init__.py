@@ -4,8 +4,7 @@ from jaxdrones.ros2.command import Command, Mode
 from jaxdrones.ros2.failsafe import Failsafe, PeerLost
 from jaxdrones.ros2.node import Flown, Node
 from jaxdrones.ros2.simulation import Simulation
-from jaxdrones.ros2.topics import QoS, Topic
-from jaxdrones.ros2.transport import Transport
+from jaxdrones.ros2.topics import QoS, Topic, Transport
 
 __all__ = [
     "Command",

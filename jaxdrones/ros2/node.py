@@ -15,8 +15,7 @@ from jaxdrones.ros2.bag import Recorder
 from jaxdrones.ros2.command import Mode
 from jaxdrones.ros2.failsafe import Failsafe, PeerLost, Watch, hover, sink
 from jaxdrones.ros2.simulation import Simulation
-from jaxdrones.ros2.topics import Topic
-from jaxdrones.ros2.transport import Transport
+from jaxdrones.ros2.topics import Topic, Transport
 from jaxdrones.sensing import Camera
 
 _LATE = 0.1  # s, largest lag behind the clock before the schedule restarts

@@ -20,8 +20,7 @@ except ImportError as error:
     ) from error
 
 from jaxdrones.ros2 import messages as msg
-from jaxdrones.ros2.topics import QoS, Topic
-from jaxdrones.ros2.transport import Answer
+from jaxdrones.ros2.topics import Answer, QoS, Topic
 
 _LOOK = 1.0  # s between checks of the other endpoints
 

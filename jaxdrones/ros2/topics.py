@@ -1,4 +1,4 @@
-"""Topics of a team: names, standard message types and quality of service.
+"""Topics of a team, names, standard message types and quality of service, and the interface of their transport.
 
 Frames follow REP-103: `world` is east, north, up (the world frame of the simulator), a body has x forward, y left and z
 up, and a camera's optical frame has x right, y down and z forward. Units are SI, except for rotor speeds in RPM.
@@ -7,6 +7,10 @@ up, and a camera's optical frame has x right, y down and z forward. Units are SI
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from jaxdrones.ros2.messages import Message
 
 WORLD = "world"
 """Frame of positions."""
@@ -82,3 +86,32 @@ def output(i: int, name: str) -> Topic:
 def command(i: int, name: str) -> Topic:
     """Command topic of a drone; `name` is a key of `COMMANDS`."""
     return Topic(f"{drone(i)}/{name}", *COMMANDS[name])
+
+
+Answer = Callable[[], tuple[bool, str]]
+"""Handler of a `std_srvs/srv/Trigger` service: () -> (success, message)."""
+
+
+class Transport(Protocol):
+    """Publishers, subscriptions and services of type `std_srvs/srv/Trigger`; callbacks run only in `spin`."""
+
+    def publisher(self, topic: Topic) -> Callable[[Message], None]:
+        """Function that publishes messages."""
+
+    def subscribe(self, topic: Topic, receive: Callable[[Any], None]) -> None:
+        """Call a function with every message of a topic."""
+
+    def serve(self, name: str, answer: Answer) -> None:
+        """Offer a service. Messages before a request are delivered before its answer."""
+
+    def flush(self, timeout: float) -> None:
+        """Wait at most `timeout` s for delivery to all readers."""
+
+    def spin(self, timeout: float) -> None:
+        """Deliver received messages; wait up to `timeout` s for one."""
+
+    def complaints(self) -> list[str]:
+        """New mismatches with endpoints of other processes, such as another type."""
+
+    def close(self) -> None:
+        """Leave the network."""

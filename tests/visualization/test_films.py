@@ -8,7 +8,6 @@ import pytest
 
 pytest.importorskip("PIL")
 
-from jaxdrones.flights.fly import fly
 from jaxdrones.sensing import Box, Scene
 from jaxdrones.visualization import drawn_film, films, shots
 from jaxdrones.visualization.overlay import Lens, Overlay
@@ -19,8 +18,8 @@ FPS = 2
 
 
 @pytest.fixture(scope="module")
-def record():
-    return fly("circle", drones=4, duration=3.0)
+def record(part_of_circle):
+    return part_of_circle(drones=4, seconds=3.0)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from viewer_payload import decode
 from jaxdrones import assets
 from jaxdrones.cli import live, main
 from jaxdrones.visualization import browser
-from jaxdrones.visualization.viewer.gallery import read_exhibits
+from jaxdrones.visualization.viewer.page import read_exhibits
 
 CHOSEN = "document.querySelector('[aria-current]')"
 OWN = """

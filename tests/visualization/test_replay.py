@@ -19,8 +19,8 @@ pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
 
 
 @pytest.fixture(scope="module")
-def record():
-    return fly("circle", drones=2, duration=1.5)
+def record(part_of_circle):
+    return part_of_circle(drones=2, seconds=1.5)
 
 
 def read(path) -> tuple[dict, list[np.ndarray]]:

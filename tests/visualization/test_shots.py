@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from jaxdrones.flights.fly import fly
 from jaxdrones.sensing import Cylinder, Scene, Sphere, ray, room
 from jaxdrones.visualization.overlay import Lens
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
@@ -16,8 +15,8 @@ TRUNKS = np.random.default_rng(0).uniform([0, -6, 2], [20, 6, 2], (30, 3))
 
 
 @pytest.fixture(scope="module")
-def circle():
-    return fly("circle", drones=3, duration=4.0)
+def circle(part_of_circle):
+    return part_of_circle(drones=3, seconds=4.0)
 
 
 def along(record, path, scene=None):

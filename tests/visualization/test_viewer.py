@@ -37,11 +37,6 @@ SCENE = Scene.of(
 
 
 @pytest.fixture(scope="module")
-def record():
-    return fly("circle", drones=2, duration=0.5)
-
-
-@pytest.fixture(scope="module")
 def team():
     return jd.repeat(jd.load_params("cf2x"), 3)
 

@@ -1,16 +1,18 @@
-"""Viewer page as a file, and in a notebook."""
+"""Viewer page as a file and in a notebook, and the page with a list of flights."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import html
+import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.writing import write
 
-_TEMPLATE = Path(__file__).with_name("page.html")
+_TEMPLATE, _GALLERY = (Path(__file__).with_name(name) for name in ("page.html", "gallery.html"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,3 +61,28 @@ def template() -> str:
             f"the viewer's page is not built: {_TEMPLATE} is missing; run `make viewer` in the sources, which needs "
             "npm, or install the wheel"
         ) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Exhibit:
+    """Flight in a gallery."""
+
+    name: str
+    """Title, and the part of the address after #."""
+    about: str
+    """Description of the flight and of its success, a few sentences."""
+    command: str
+    """Command that flies it."""
+    payload: str
+    """Result of `payload.encode`."""
+
+
+def gallery(exhibits: Sequence[Exhibit]) -> str:
+    """HTML text of a self-contained page that begins with the first flight."""
+    data = {"player": template(), "exhibits": [dataclasses.asdict(exhibit) for exhibit in exhibits]}
+    return _GALLERY.read_text(encoding="utf-8").replace("@DATA@", json.dumps(data).replace("<", "\\u003c"))
+
+
+def read_exhibits(folder: Path) -> list[Exhibit]:
+    """Flights of a folder, in the order of the names of its JSON files."""
+    return [Exhibit(**json.loads(path.read_bytes())) for path in sorted(folder.glob("*.json"))]

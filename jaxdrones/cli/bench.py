@@ -12,6 +12,7 @@ from jaxdrones import arguments
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
+from jaxdrones.cli.options import option
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
@@ -38,11 +39,10 @@ def add(commands) -> None:
         description="Measure the throughput of this machine in float32: the plant, the plant under a controller, and "
         "an environment, without compilation. The last line is a summary to share.",
     )
-    parser.add_argument(
-        "--worlds", type=_counts, metavar="N,N", help="numbers of worlds (1024,16384; more on an accelerator)"
-    )
-    parser.add_argument("--seconds", type=float, default=25.0, metavar="S", help="time limit, s (25)")
-    parser.set_defaults(run=_bench, ranges=dict(seconds=arguments.number("s", above=0), worlds=_check_worlds))
+    counts = "numbers of worlds (1024,16384; more on an accelerator)"
+    option(parser, "--worlds N,N", counts, _counts, check=_check_worlds)
+    option(parser, "--seconds S", "time limit, s", float, 25.0, check=arguments.number("s", above=0))
+    parser.set_defaults(run=_bench)
 
 
 def _counts(text: str) -> list[int]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import check_writable, folder, print_error, print_warning, until_interrupted
-from jaxdrones.cli.options import add_output, add_vehicle
+from jaxdrones.cli.options import add_output, add_vehicle, option, switch
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.errors import UserError
@@ -23,7 +23,7 @@ from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 from jaxdrones.training.betaflight_pilot import PolicyPilot
 
-_MAX_HZ = 8000
+_RATE = whole("rate of the physics (Hz)", limit=8000)
 _TAKE_OFF = 4.0  # s after arming from which the distance to the target counts, and a policy flies
 
 
@@ -40,33 +40,28 @@ def add(commands) -> None:
         "`jaxdrones betaflight --build` downloads the source (GPL-3.0; package `betaflight`) and compiles it once,\n"
         "with gcc and make, into ~/.cache/jaxdrones/betaflight. BETAFLIGHT_SITL=PATH selects another program.",
     )
-    parser.add_argument("--build", action="store_true", help="download and compile Betaflight, then exit")
-    parser.add_argument("--if-missing", action="store_true", help="with --build: do nothing if the program exists")
+    switch(parser, "--build", "download and compile Betaflight, then exit")
+    switch(parser, "--if-missing", "with --build: do nothing if the program exists")
     add_vehicle(parser, "racer")
     pilots = parser.add_argument_group("pilot")
     clock = parser.add_argument_group("clock")
     files = parser.add_argument_group("files and output")
-    pilots.add_argument("--target", default="0,0,1.5", metavar="X,Y,Z", help="position to fly to, m (0,0,1.5)")
-    pilots.add_argument("--flip", type=float, metavar="S", help="time of a flip after arming, s")
-    pilots.add_argument("--policy", type=folder, metavar="RUN", help="fly a policy, with action=thrust_and_rates")
-    pilots.add_argument("--joystick", type=Path, metavar="DEVICE", help="fly by hand, such as /dev/input/js0")
-    pilots.add_argument(
-        "--axes",
+    option(pilots, "--target X,Y,Z", "position to fly to, m", default="0,0,1.5")
+    option(pilots, "--flip S", "time of a flip after arming, s", float, check=number("s", at_least=0))
+    option(pilots, "--policy RUN", "fly a policy, with action=thrust_and_rates", folder)
+    option(pilots, "--joystick DEVICE", "fly by hand, such as /dev/input/js0", Path)
+    option(
+        pilots,
+        "--axes R,P,T,Y",
+        "axes of roll, pitch, throttle, yaw; -1 is axis 0 reversed, -2 is axis 1 reversed, ...",
         default=",".join(map(str, AXES)),
-        metavar="R,P,T,Y",
-        help="axes of roll, pitch, throttle, yaw (0,1,2,3); -1 is axis 0 reversed, -2 is axis 1 reversed, ...",
     )
-    clock.add_argument("--duration", type=float, metavar="S", help="simulated time after arming, s (until Ctrl-C)")
-    clock.add_argument(
-        "--physics-hz", type=int, default=1000, metavar="HZ", help="states per second, a multiple of 100 (1000)"
-    )
-    clock.add_argument(
-        "--real-time", action="store_true", help="follow the clock; by default each step waits for motor outputs"
-    )
-    clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time to arm Betaflight, s (30)")
+    option(clock, "--duration S", "simulated time after arming, s (until Ctrl-C)", float, check=number("s", above=0))
+    option(clock, "--physics-hz HZ", "states per second, a multiple of 100", int, 1000, _RATE)
+    switch(clock, "--real-time", "follow the clock; by default each step waits for motor outputs")
+    option(clock, "--wait S", "longest time to arm Betaflight, s", float, 30.0, check=number("s", above=0))
     add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
-    ranges = dict(duration=number("s", above=0), wait=number("s", above=0), flip=number("s", at_least=0))
-    parser.set_defaults(run=_run, ranges=ranges | dict(physics_hz=whole("rate of the physics (Hz)", limit=_MAX_HZ)))
+    parser.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> int:

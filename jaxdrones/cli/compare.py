@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxdrones.cli.common import check_writable
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
-from jaxdrones.cli.options import add_no_figure, add_output, split_names
+from jaxdrones.cli.options import add_no_figure, add_output, option, split_names
 from jaxdrones.cli.report import print_results, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -29,14 +29,12 @@ def add(commands) -> None:
         "it by several controllers with the same set-points and print the errors of each. With --output draw paths "
         "and errors of all, too.",
     )
-    parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
+    option(parser, "flight FLIGHT", ", ".join(FLIGHTS))
     add_conditions(parser)
     compared = parser.add_argument_group("comparison")
     files = parser.add_argument_group("files and output")
-    compared.add_argument("--backends", metavar="A,B", help=f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
-    compared.add_argument(
-        "--controllers", metavar="A,B", help=f"in place of --backends: two or more of {', '.join(CONTROLLERS)}"
-    )
+    option(compared, "--backends A,B", f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
+    option(compared, "--controllers A,B", f"in place of --backends: two or more of {', '.join(CONTROLLERS)}")
     add_output(files, "folder of figure and logs (none)")
     add_no_figure(files)
     parser.set_defaults(run=_compare)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from jaxdrones.arguments import choice
 from jaxdrones.cli.export import TARGETS
 from jaxdrones.cli.names import known_names
+from jaxdrones.cli.options import option
 from jaxdrones.cli.settings import REALISTIC_KINDS
 from jaxdrones.errors import UserError, install
 
@@ -38,8 +39,8 @@ def add(commands, root: argparse.ArgumentParser) -> None:
         "  zsh    jaxdrones completion zsh > ~/.zfunc/_jaxdrones     with ~/.zfunc in $fpath before compinit\n"
         "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
     )
-    parser.add_argument("shell", metavar="SHELL", help=", ".join(SHELLS))
-    parser.set_defaults(run=functools.partial(_completion, root), ranges=dict(shell=choice("shell", SHELLS)))
+    option(parser, "shell SHELL", ", ".join(SHELLS), check=choice("shell", SHELLS))
+    parser.set_defaults(run=functools.partial(_completion, root))
 
 
 def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> int:

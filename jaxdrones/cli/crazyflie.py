@@ -5,14 +5,14 @@ from pathlib import Path
 
 from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import check_writable, print_error, until_interrupted
-from jaxdrones.cli.options import add_output, add_vehicle
+from jaxdrones.cli.options import add_output, add_vehicle, option
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
 from jaxdrones.firmware.crazyflie.server import PORT
 from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 
-_MAX_PORT = 65535
+_PORT = whole("port", limit=65535)
 _EXAMPLE = "export CFLIB_URI=udp://127.0.0.1:19850"
 
 
@@ -29,14 +29,11 @@ def add(commands) -> None:
         "trajectories, arming and emergency stops. Ctrl-C ends the flight and writes its log.",
     )
     add_vehicle(parser, "cf2x")
-    parser.add_argument("--port", type=int, default=PORT, metavar="PORT", help=f"UDP port, on 127.0.0.1 ({PORT})")
-    parser.add_argument("--duration", type=float, metavar="S", help="simulated time, s (until Ctrl-C)")
-    parser.add_argument(
-        "--speed", type=float, default=1.0, metavar="X", help="real-time factor (1); scripts keep their own clock"
-    )
+    option(parser, "--port PORT", "UDP port, on 127.0.0.1", int, PORT, check=_PORT)
+    option(parser, "--duration S", "simulated time, s (until Ctrl-C)", float, check=number("s", above=0))
+    option(parser, "--speed X", "real-time factor; scripts keep their own clock", float, 1.0, check=number(above=0))
     add_output(parser, "folder of the log (runs/crazyflie)", Path("runs") / "crazyflie")
-    ranges = dict(port=whole("port", limit=_MAX_PORT), duration=number("s", above=0), speed=number(above=0))
-    parser.set_defaults(run=_run, ranges=ranges)
+    parser.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ from jaxdrones.checks import look_up
 from jaxdrones.cli import fly
 from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.live import add_live
-from jaxdrones.cli.options import add_drones, add_output, add_set
+from jaxdrones.cli.options import add_drones, add_output, add_set, option, switch
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import parse_settings
@@ -33,20 +33,20 @@ def add(commands) -> None:
         "network.",
         epilog="`jaxdrones demo forest --live` simulates a new flight, `jaxdrones eval forest` evaluates its policy.",
     )
-    parser.add_argument("flight", nargs="?", default=_FIRST, metavar="FLIGHT", help=f"flight to show first ({_FIRST})")
-    parser.add_argument(
-        "--policy",
-        type=folder,
-        metavar="RUN",
-        help="policy of the interactive simulation of --drones drones: a run of hover for one drone; or file.py:name, "
+    option(parser, "flight FLIGHT", "flight to show first", default=_FIRST, nargs="?")
+    option(
+        parser,
+        "--policy RUN",
+        "policy of the interactive simulation of --drones drones: a run of hover for one drone; or file.py:name, "
         "whose code is executed; needs casadi",
+        folder,
     )
-    parser.add_argument("--task", metavar="TASK", help="with file.py:name: task (hover), as for `jaxdrones train`")
+    option(parser, "--task TASK", "with file.py:name: task (hover), as for `jaxdrones train`")
     add_set(parser, "with file.py:name: option of the environment (action, observation, ...)")
     add_drones(parser, 1)
     add_live(parser, "instead of the page, simulate FLIGHT and show it in the browser in real time")
     add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
-    parser.add_argument("--no-open", action="store_true", help="write the page and do not open it")
+    switch(parser, "--no-open", "write the page and do not open it")
     parser.set_defaults(run=_demo)
 
 

@@ -6,14 +6,13 @@ from typing import Any
 import jax
 
 from jaxdrones import arguments
-from jaxdrones.arguments import choice, number
+from jaxdrones.arguments import number
 from jaxdrones.cli.common import DIVERGED, print_error
-from jaxdrones.cli.options import add_backend, add_drones
+from jaxdrones.cli.options import add_backend, add_drones, option, switch
 from jaxdrones.cli.policies import add_policy, open_policy, policy_of, team_of_run
 from jaxdrones.cli.report import evaluation_table, percent, print_results
 from jaxdrones.cli.settings import given_settings
 from jaxdrones.errors import UserError
-from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.learning import evaluate
 from jaxdrones.training.run import report_as_dict
 
@@ -32,15 +31,12 @@ def add(commands) -> None:
     evaluation = parser.add_argument_group("evaluation")
     add_drones(evaluation)
     add_backend(evaluation)
-    evaluation.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
-    evaluation.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
-    evaluation.add_argument(
-        "--fail-below", type=float, metavar="RATE", help="exit code 1 if the success rate is lower, for example 0.9"
-    )
-    evaluation.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
-    passing, backend = number(name="fail-below", above=0, at_most=1), choice("backend", BACKENDS)
-    ranges = dict(episodes=arguments.count, seed=arguments.seed, fail_below=passing, backend=backend)
-    parser.set_defaults(run=_evaluate, ranges=ranges)
+    option(evaluation, "--episodes N", "number of episodes", int, 1000, check=arguments.count)
+    option(evaluation, "--seed K", "seed of starts and noise", int, 0, check=arguments.seed)
+    rate = number(name="fail-below", above=0, at_most=1)
+    option(evaluation, "--fail-below RATE", "exit code 1 if the success rate is lower, such as 0.9", float, check=rate)
+    switch(evaluation, "--last", "evaluate the newest policy instead of the best")
+    parser.set_defaults(run=_evaluate)
 
 
 def _evaluate(options: argparse.Namespace) -> int:

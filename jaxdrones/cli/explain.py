@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
+from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle, option
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import add_realistic, given_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
@@ -16,7 +16,7 @@ def add(commands) -> None:
         description="Print a table of every entry of observation and action (name, unit, frame, range, meaning of -1, "
         "0 and 1), the rewards, the terminations, and the simulation of an environment.",
     )
-    parser.add_argument("task", metavar="TASK", help=f"{', '.join(TASKS)}, or file.py:function")
+    option(parser, "task TASK", f"{', '.join(TASKS)}, or file.py:function")
     add_drones(parser)
     add_vehicle(parser)
     add_realistic(parser)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.cli.common import check_writable, folder, print_warning
-from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle, split_names
+from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle, option, split_names, switch
 from jaxdrones.cli.report import print_results
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
@@ -32,23 +32,16 @@ def add(commands) -> None:
         "errors, and write a folder with vehicle.urdf, report.json and a figure. Other commands take vehicle.urdf as "
         "--vehicle; `jaxdrones score` takes the folder.",
     )
-    parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")
+    option(parser, "logs FLIGHT", "flights to fit", folder, nargs="+")
     model = parser.add_argument_group("model and data")
     files = parser.add_argument_group("files and output")
     add_vehicle(model, "cf2x", "initial values: ")
-    model.add_argument(
-        "--parameters",
-        metavar="A,B",
-        help="parameters to fit, such as kf,inertia,drag_coeff (those identifiable from such logs)",
+    option(
+        model,
+        "--parameters A,B",
+        "parameters to fit, such as kf,inertia,drag_coeff (those identifiable from such logs)",
     )
-    model.add_argument(
-        "--validate",
-        nargs="+",
-        type=folder,
-        default=[],
-        metavar="FLIGHT",
-        help="held-out flights to choose the best round of the fit",
-    )
+    option(model, "--validate FLIGHT", "held-out flights to choose the best round of the fit", folder, [], nargs="+")
     add_log_options(model)
     add_output(files, "folder of the fit, without an earlier fit (runs/fit)", Path("runs/fit"))
     add_no_figure(files)
@@ -82,13 +75,11 @@ def _fit(options: argparse.Namespace) -> int:
 
 def add_log_options(group) -> None:
     """Add --propellers and --allow-inconsistent."""
-    group.add_argument(
-        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
-    )
-    group.add_argument(
+    option(group, "--propellers NAME", "propellers of the Crazyflie, for logs with PWM", default="2.1+")
+    switch(
+        group,
         "--allow-inconsistent",
-        action="store_true",
-        help="accept logs with contradictory columns (wrong clock, axes, order of motors), with a warning",
+        "accept logs with contradictory columns (wrong clock, axes, order of motors), with a warning",
     )
 
 

@@ -4,8 +4,9 @@ import argparse
 import contextlib
 from typing import Any
 
+from jaxdrones.arguments import seed
 from jaxdrones.cli.common import bar, print_error
-from jaxdrones.cli.options import add_drones, add_vehicle, split_names
+from jaxdrones.cli.options import add_drones, add_vehicle, option, split_names
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.fly import fly
@@ -21,8 +22,8 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("flight")
     add_drones(group)
     add_vehicle(group, "cf2x")
-    group.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
-    group.add_argument("--controller", metavar="NAME", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    option(group, "--effects A,B", f"{', '.join(EFFECTS | PAIRS)}, or none")
+    option(group, "--controller NAME", f"{', '.join(CONTROLLERS)} (the vehicle's own)")
     group.add_argument(
         "--feedforward",
         action=argparse.BooleanOptionalAction,
@@ -30,18 +31,11 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
         help="feed velocity and acceleration of the target to the controller (yes; for pid only in a comparison of "
         "controllers)",
     )
-    group.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
-    group.add_argument("--duration", type=float, metavar="S", help="simulated time, s")
-    group.add_argument("--rotors", default="instant", metavar="NAME", help=f"{', '.join(ROTORS)} (instant)")
-    group.add_argument(
-        "--integrator",
-        default="semi_implicit_euler",
-        metavar="NAME",
-        help=f"{', '.join(INTEGRATORS)} (semi_implicit_euler)",
-    )
-    group.add_argument(
-        "--seed", type=int, metavar="K", help="seed of a random start, 1 cm standard deviation, or of an episode"
-    )
+    option(group, "--control-hz HZ", "control rate; physics runs at 240 Hz or above", int)
+    option(group, "--duration S", "simulated time, s", float)
+    option(group, "--rotors NAME", ", ".join(ROTORS), default="instant")
+    option(group, "--integrator NAME", ", ".join(INTEGRATORS), default="semi_implicit_euler")
+    option(group, "--seed K", "seed of a random start, 1 cm standard deviation, or of an episode", int, check=seed)
 
 
 def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:

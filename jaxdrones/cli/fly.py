@@ -9,17 +9,15 @@ from typing import Any
 
 import jax
 
-from jaxdrones import arguments
 from jaxdrones.cli.common import check_writable, folder, print_error
 from jaxdrones.cli.flight_options import CONDITIONS, add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
-from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
+from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set, option, switch
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
 from jaxdrones.cli.report import described, print_results, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
-from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import check_pwm, save_csv, save_npz
 from jaxdrones.flights.log import FlightLog, LoggedConditions
@@ -42,47 +40,36 @@ def add(commands) -> None:
         "A flight has diverged if at its end a drone is upside down, or its error is 1 m (or 1 m/s) larger than at\n"
         "the start. Files of an earlier flight in --output are replaced.",
     )
-    parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
+    option(parser, "flight FLIGHT", ", ".join(FLIGHTS), nargs="?")
     add_conditions(parser)
     policy = parser.add_argument_group("policy")
     bullet = parser.add_argument_group("backend")
     shown = parser.add_argument_group("films and pictures")
     files = parser.add_argument_group("files and output")
-    policy.add_argument(
-        "--policy",
-        type=folder,
-        metavar="RUN",
-        help="in place of FLIGHT: a folder of `jaxdrones train`; a task with a bundled policy (`jaxdrones list`), for "
+    option(
+        policy,
+        "--policy RUN",
+        "in place of FLIGHT: a folder of `jaxdrones train`; a task with a bundled policy (`jaxdrones list`), for "
         "example forest; any-vehicle or raptor; or file.py:name, whose code is executed",
+        folder,
     )
-    policy.add_argument(
-        "--task", metavar="TASK", help="with file.py:name, any-vehicle or raptor: task, as for `jaxdrones train`"
-    )
+    option(policy, "--task TASK", "with file.py:name, any-vehicle or raptor: task, as for `jaxdrones train`")
     add_realistic(policy, "with file.py:name: ")
     add_set(policy, "with file.py:name: option of the environment (action, observation, ...)")
     add_backend(bullet)
-    bullet.add_argument(
-        "--obstacles", action="store_true", help="add the obstacles of gym-pybullet-drones (2021) (bullet)"
-    )
-    bullet.add_argument("--gui", action="store_true", help="show Bullet's window, with motor sliders (bullet)")
-    shown.add_argument("--video", type=folder, metavar="FILE", help="film of the flight, .mp4 or .gif")
-    shown.add_argument(
-        "--renderer",
-        metavar="NAME",
-        help=f"of the film: {', '.join(films.RENDERERS)} (page if Chromium is installed, else jax)",
+    switch(bullet, "--obstacles", "add the obstacles of gym-pybullet-drones (2021) (bullet)")
+    switch(bullet, "--gui", "show Bullet's window, with motor sliders (bullet)")
+    option(shown, "--video FILE", "film of the flight, .mp4 or .gif", folder)
+    option(
+        shown, "--renderer NAME", f"of the film: {', '.join(films.RENDERERS)} (page if Chromium is installed, else jax)"
     )
     add_live(shown, "show the flight in the browser in real time")
-    shown.add_argument(
-        "--cameras",
-        action="store_true",
-        help="write the images of each drone's camera as PNG and into the log",
-    )
+    switch(shown, "--cameras", "write the images of each drone's camera as PNG and into the log")
     add_output(files, "folder of log and figure (runs/FLIGHT, RUN/flight)")
-    files.add_argument("--csv", action="store_true", help="write the log as CSV too")
-    files.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
+    switch(files, "--csv", "write the log as CSV too")
+    switch(files, "--pwm", "log the Crazyflie's PWM signals too (cf2x, cf2p)")
     add_no_figure(files)
-    ranges = dict(backend=arguments.choice("backend", BACKENDS), seed=arguments.seed)
-    parser.set_defaults(run=functools.partial(_fly, parser), ranges=ranges)
+    parser.set_defaults(run=functools.partial(_fly, parser))
 
 
 def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:

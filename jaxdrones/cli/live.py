@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from jaxdrones.cli.options import option
 from jaxdrones.cli.report import percent
 from jaxdrones.training.episode import fly_episode
 from jaxdrones.visualization.viewer.live import Live
@@ -21,7 +22,7 @@ WAIT = 60.0
 def add_live(parser: argparse._ActionsContainer, what: str) -> None:
     """Add --live, with an optional port; the default of 0 is any free port."""
     text = f"{what}; prints its local address (at a free PORT)"
-    parser.add_argument("--live", type=int, nargs="?", const=0, metavar="PORT", help=text)
+    option(parser, "--live PORT", text, int, nargs="?", const=0)
 
 
 @contextlib.contextmanager

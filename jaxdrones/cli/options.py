@@ -1,33 +1,51 @@
 """Options shared by several commands, with one meaning and one help text each."""
 
 from pathlib import Path
+from typing import Any
 
 from jaxdrones import assets
+from jaxdrones.arguments import Check, choice, whole
 from jaxdrones.cli.common import folder
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 
 
+def option(
+    group, name: str, text: str, kind: Any = str, default: Any = None, check: Check | None = None, **more: Any
+) -> None:
+    """Add an option or argument such as `--speed X`, with its default in the help, and the range of its values."""
+    flag, _, metavar = name.partition(" ")
+    if type(default) in (str, int, float):
+        text += f" ({default:g})" if isinstance(default, float) else f" ({default})"
+    added = group.add_argument(flag, type=kind, default=default, metavar=metavar, help=text, **more)
+    if check is not None:
+        group.set_defaults(ranges=(group.get_default("ranges") or {}) | {added.dest: check})
+
+
+def switch(group, name: str, text: str) -> None:
+    """Add an option without a value."""
+    group.add_argument(name, action="store_true", help=text)
+
+
 def add_drones(group, default: int | None = None) -> None:
     """Add --drones."""
-    text = "number of drones" + ("" if default is None else f" ({default})")
-    group.add_argument("--drones", type=int, default=default, metavar="N", help=text)
+    option(group, "--drones N", "number of drones", int, default, whole())
 
 
 def add_vehicle(group, default: str | None = None, where: str = "") -> None:
     """Add --vehicle; `default` is `None` where the recipe of a run has the vehicle."""
-    text = f"{where}{', '.join(assets.vehicles())} or a .urdf file (cf2x)"
-    group.add_argument("--vehicle", default=default, metavar="NAME|URDF", help=text)
+    text = f"{where}{', '.join(assets.vehicles())} or a .urdf file"
+    option(group, "--vehicle NAME|URDF", text + " (cf2x)" * (default is None), default=default)
 
 
 def add_backend(group) -> None:
     """Add --backend."""
-    group.add_argument("--backend", default="explicit", metavar="NAME", help=f"{', '.join(BACKENDS)} (explicit)")
+    option(group, "--backend NAME", ", ".join(BACKENDS), default="explicit", check=choice("backend", BACKENDS))
 
 
 def add_set(group, text: str) -> None:
     """Add --set, which may be repeated."""
-    group.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=text)
+    option(group, "--set NAME=VALUE", text, default=[], action="append")
 
 
 def add_output(group, text: str, default: Path | None = None, metavar: str = "DIR") -> None:
@@ -37,7 +55,7 @@ def add_output(group, text: str, default: Path | None = None, metavar: str = "DI
 
 def add_no_figure(group) -> None:
     """Add --no-figure."""
-    group.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
+    switch(group, "--no-figure", "write no figure; needs no matplotlib")
 
 
 def split_names(text: str) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 from jaxdrones import assets
 from jaxdrones.checks import hint
 from jaxdrones.cli.common import folder, run_folder
-from jaxdrones.cli.options import add_set, add_vehicle
+from jaxdrones.cli.options import add_set, add_vehicle, option
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic
 from jaxdrones.errors import UserError
@@ -39,15 +39,15 @@ def output_folder(policy: Path, what: str) -> Path:
 
 def add_policy(parser: argparse.ArgumentParser, others: str = "") -> argparse._ArgumentGroup:
     """Add the argument RUN, which may be `others`, too; return the group of options for a policy that is no run."""
-    parser.add_argument(
-        "policy",
-        type=folder,
-        metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
+    option(
+        parser,
+        "policy RUN",
+        "folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
         f"{others}or file.py:name, whose code is executed",
+        folder,
     )
     own = parser.add_argument_group("your own policy", "only for a policy that is not a run")
-    own.add_argument("--task", metavar="TASK", help="task of the policy, as for `jaxdrones train`")
+    option(own, "--task TASK", "task of the policy, as for `jaxdrones train`")
     add_vehicle(own)
     add_realistic(own)
     add_set(own, "option of the environment (action, observation, ...)")

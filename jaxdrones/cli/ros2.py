@@ -9,12 +9,12 @@ from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
 from jaxdrones.cli.common import folder, print_error, print_warning, until_interrupted
-from jaxdrones.cli.options import add_backend, add_drones, add_vehicle, parse_pixels
+from jaxdrones.cli.options import add_backend, add_drones, add_vehicle, option, parse_pixels, switch
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
-from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ
+from jaxdrones.flights.conditions import PHYSICS_HZ
 from jaxdrones.params import repeat
 from jaxdrones.ros2 import bag, topics
 from jaxdrones.ros2.command import CONTROLLERS
@@ -26,7 +26,7 @@ from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
-_MAX_HZ = 20_000
+_RATE = whole("control rate (Hz)", limit=20_000)
 _OF_REPLAY = ("bag", "speed", "json", "run", "ranges", "debug")
 
 
@@ -37,39 +37,31 @@ def add(commands) -> None:
     add_drones(team, 1)
     add_vehicle(team, "cf2x")
     add_backend(team)
-    team.add_argument(
-        "--controller", metavar="NAME", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's)"
-    )
-    team.add_argument("--control-hz", type=int, default=100, metavar="HZ", help="control and message rate (100)")
-    team.add_argument("--height", type=float, default=1.0, metavar="M", help="initial height, m (1)")
+    known = f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's)"
+    option(team, "--controller NAME", known, check=choice("controller", CONTROLLERS))
+    option(team, "--control-hz HZ", "control and message rate", int, 100, _RATE)
+    option(team, "--height M", "initial height, m", float, 1.0, check=number("m", above=0))
     watch = parser.add_argument_group("clock and failsafe")
     wire = parser.add_argument_group("messages")
     pace = watch.add_mutually_exclusive_group()
-    pace.add_argument("--lockstep", action="store_true", help="one step for each call of the service /step")
-    pace.add_argument("--real-time", action="store_true", help="follow the clock (default)")
-    watch.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
-    watch.add_argument("--duration", type=float, metavar="S", help="simulated time, s (until Ctrl-C)")
-    wire.add_argument("--camera", metavar="WxH", help="resolution of a camera on every drone, pixels (none)")
-    wire.add_argument("--camera-hz", type=float, default=10.0, metavar="HZ", help="images per second (10)")
-    watch.add_argument(
-        "--timeout", type=float, default=1.0, metavar="S", help="seconds without a command before the failsafe acts (1)"
-    )
-    watch.add_argument(
-        "--wait", type=float, default=30.0, metavar="S", help="the same timeout before the first command (30)"
-    )
-    watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
-    wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
-    numbers = dict(drones=whole(), speed=number(above=0), duration=number("s", at_least=0), height=number("m", above=0))
-    names = dict(backend=choice("backend", BACKENDS), controller=choice("controller", CONTROLLERS))
-    ranges = numbers | names | dict(control_hz=whole("control rate (Hz)", limit=_MAX_HZ))
-    parser.set_defaults(run=_run, ranges=ranges)
+    switch(pace, "--lockstep", "one step for each call of the service /step")
+    switch(pace, "--real-time", "follow the clock (default)")
+    option(watch, "--speed X", "real-time factor", float, 1.0, check=number(above=0))
+    option(watch, "--duration S", "simulated time, s (until Ctrl-C)", float, check=number("s", at_least=0))
+    option(wire, "--camera WxH", "resolution of a camera on every drone, pixels (none)")
+    option(wire, "--camera-hz HZ", "images per second", float, 10.0)
+    option(watch, "--timeout S", "seconds without a command before the failsafe acts", float, 1.0)
+    option(watch, "--wait S", "the same timeout before the first command", float, 30.0)
+    option(watch, "--failsafe NAME", ", ".join(ACTIONS), default="hover")
+    option(wire, "--record BAG", "write all messages to this new folder, as MCAP", folder)
+    parser.set_defaults(run=_run)
     commands = parser.add_subparsers(metavar="[replay]", title="commands")
     replay = commands.add_parser("replay", help="publish the messages of a bag")
-    replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
-    replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
+    option(replay, "bag BAG", "folder of a bag; nothing is simulated", folder)
+    option(replay, "--speed X", "real-time factor", float, 1.0, check=number(above=0))
     for name in ("--json", "--debug"):  # as before `replay`
         replay.add_argument(name, action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-    replay.set_defaults(run=functools.partial(_replay, parser), ranges=dict(speed=number(above=0)))
+    replay.set_defaults(run=functools.partial(_replay, parser))
 
 
 def join() -> topics.Transport:

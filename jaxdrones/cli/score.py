@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_log_options, load_logs
+from jaxdrones.cli.options import option
 from jaxdrones.cli.report import print_results
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
@@ -28,18 +29,11 @@ def add(commands) -> None:
         "its errors after 0.1, 0.25 and 0.5 s, beside those of a constant state and of the nominal vehicle. A log with "
         "set-points is also simulated as a whole, with the firmware's PID (closed loop).",
     )
-    parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="logs, see `jaxdrones fit`")
-    parser.add_argument(
-        "--vehicle",
-        required=True,
-        metavar="NAME|URDF|DIR",
-        help="a bundled vehicle, URDF, or folder of `jaxdrones fit`",
-    )
-    parser.add_argument(
-        "--nominal", default=_NOMINAL, metavar="NAME|URDF", help=f"nominal vehicle, for comparison ({_NOMINAL})"
-    )
+    option(parser, "logs FLIGHT", "logs, see `jaxdrones fit`", folder, nargs="+")
+    option(parser, "--vehicle NAME|URDF|DIR", "a bundled vehicle, URDF, or folder of `jaxdrones fit`", required=True)
+    option(parser, "--nominal NAME|URDF", "nominal vehicle, for comparison", default=_NOMINAL)
     add_log_options(parser)
-    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")
+    option(parser, "--figure FILE", "draw recorded and simulated paths (.png or .pdf)", Path)
     parser.set_defaults(run=_score)
 
 

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.cli.options import option
 from jaxdrones.envs import TASKS
 from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
@@ -24,15 +25,15 @@ REALISTIC_KINDS = ("any",)
 
 def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
     """Add --realistic, with the optional argument `any`; `where` is a prefix of its help."""
-    parser.add_argument(
-        "--realistic",
+    option(
+        parser,
+        "--realistic any",
+        f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` a random vehicle "
+        "of 20 g to 3 kg in every episode",
+        _kind,
+        False,
         nargs="?",
         const=True,
-        default=False,
-        type=_kind,
-        metavar="any",
-        help=f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` a random vehicle "
-        "of 20 g to 3 kg in every episode",
     )
 
 
@@ -45,9 +46,9 @@ def _kind(text: str) -> str:
 def task_first(arguments: list[str]) -> list[str]:
     """Reorder `--realistic TASK` to `TASK --realistic`."""
     arguments = list(arguments)
-    for i, (option, word) in enumerate(itertools.pairwise(arguments)):
-        if option == "--realistic" and (word in TASKS or is_reference(word)):
-            arguments[i : i + 2] = word, option
+    for i, (given, word) in enumerate(itertools.pairwise(arguments)):
+        if given == "--realistic" and (word in TASKS or is_reference(word)):
+            arguments[i : i + 2] = word, given
     return arguments
 
 

@@ -15,7 +15,7 @@ from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import add_live, live_server, show_training
 from jaxdrones.cli.names import ALGORITHMS
-from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle
+from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle, option, switch
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_request import Request, remaining
@@ -31,7 +31,7 @@ from jaxdrones.training.run import Run
 from jaxdrones.training.trainer import Trainer
 from jaxdrones.visualization import plots
 
-_MAX_SEEDS = 1000
+_SEEDS = arguments.whole(limit=1000)
 _HOSTS_HELP = (
     "Worlds are sharded over all devices. Each core of a CPU counts as a device, up to four; JAX_NUM_CPU_DEVICES=N\n"
     "sets another number. On several hosts, start the same command on each, with a\n"
@@ -66,9 +66,7 @@ def add(commands) -> None:
         "evaluated or flown: open only runs that you trust.",
         epilog=_HOSTS_HELP,
     )
-    parser.add_argument(
-        "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function that returns a task"
-    )
+    option(parser, "task TASK", f"{', '.join(TASKS)}; or file.py:function, a function that returns a task")
     task = parser.add_argument_group("task and learner")
     schedule = parser.add_argument_group("schedule")
     files = parser.add_argument_group("files and output")
@@ -76,61 +74,46 @@ def add(commands) -> None:
     add_drones(task)
     add_vehicle(task)
     add_realistic(task)
-    task.add_argument("--algo", metavar="NAME", help=f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
+    option(task, "--algo NAME", f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
     add_set(
         task, "setting of the learner (worlds, horizon, learning_rate) or option of the environment (period, action)"
     )
-    schedule.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds, each in DIR/seed-K (1)")
-    schedule.add_argument("--seed", type=int, metavar="K", help="first seed (0)")
-    schedule.add_argument(
-        "--budget",
-        metavar="N|Ns",
-        help="number of updates, such as 300, or total time per seed, such as 60s, 5m or 2h",
-    )
-    schedule.add_argument(
-        "--stop-at",
-        type=float,
-        metavar="RATE",
-        help="stop when three consecutive evaluations reach this lower bound of the success rate, such as 0.99; "
+    option(schedule, "--seeds N", "train N seeds, each in DIR/seed-K", int, 1, check=_SEEDS)
+    option(schedule, "--seed K", "first seed (0)", int, check=arguments.seed)
+    option(schedule, "--budget N|Ns", "number of updates, such as 300, or total time per seed, such as 60s, 5m or 2h")
+    option(
+        schedule,
+        "--stop-at RATE",
+        "stop when three consecutive evaluations reach this lower bound of the success rate, such as 0.99; "
         "evaluates more often",
+        float,
     )
-    schedule.add_argument(
-        "--sweep",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE,VALUE",
-        help="train once for each value of a setting, such as learning_rate=1e-3,3e-3, each in its own folder in DIR; "
+    option(
+        schedule,
+        "--sweep NAME=VALUE,VALUE",
+        "train once for each value of a setting, such as learning_rate=1e-3,3e-3, each in its own folder in DIR; "
         "several sweeps train all combinations",
+        default=[],
+        action="append",
     )
-    schedule.add_argument("--episodes", type=int, metavar="N", help="episodes per evaluation (1000)")
-    files.add_argument(
-        "--config",
-        metavar="FILE",
-        help="TOML file of options by their long names, such as seeds = 3, with tables [set] and [sweep]; options of "
+    option(schedule, "--episodes N", "episodes per evaluation (1000)", int, check=arguments.count)
+    option(
+        files,
+        "--config FILE",
+        "TOML file of options by their long names, such as seeds = 3, with tables [set] and [sweep]; options of "
         "the command line override it",
     )
     add_output(files, "folder of the run (runs/TASK)")
-    files.add_argument(
-        "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
-    )
-    files.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
-    files.add_argument(
-        "--keep-history",
-        action="store_true",
-        help="keep the policies of all evaluations, for `jaxdrones view RUN --history`",
-    )
-    files.add_argument(
-        "--log",
-        metavar="NAME,NAME",
-        help="log the metrics of every update with tensorboard, wandb or mlflow, if installed",
-    )
+    switch(files, "--resume", "continue the run in --output; with --budget train a finished one longer")
+    switch(files, "--overwrite", "replace the run in --output, finished or not")
+    switch(files, "--keep-history", "keep the policies of all evaluations, for `jaxdrones view RUN --history`")
+    option(files, "--log NAME,NAME", "log the metrics of every update with tensorboard, wandb or mlflow, if installed")
     add_live(files, "show learning curve and an episode in the browser after every evaluation")
     add_no_figure(files)
-    several.add_argument("--hosts", type=int, metavar="N", help="number of processes (1)")
-    several.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
-    several.add_argument("--coordinator", metavar="ADDRESS:PORT", help="address and free port of host 0")
-    ranges = dict(seeds=arguments.whole(limit=_MAX_SEEDS), seed=arguments.seed, episodes=arguments.count)
-    parser.set_defaults(run=_on_hosts, ranges=ranges)
+    option(several, "--hosts N", "number of processes (1)", int)
+    option(several, "--host I", "number of this process, from 0", int)
+    option(several, "--coordinator ADDRESS:PORT", "address and free port of host 0")
+    parser.set_defaults(run=_on_hosts)
 
 
 def _on_hosts(options: argparse.Namespace) -> int:

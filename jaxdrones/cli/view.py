@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice, whole
 from jaxdrones.cli.common import check_writable, folder
-from jaxdrones.cli.options import add_output, parse_pixels
+from jaxdrones.cli.options import add_output, option, parse_pixels, switch
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
@@ -29,29 +29,25 @@ def add(commands) -> None:
         description="Write one HTML page that plays logs of `jaxdrones fly` in 3D, with drones, obstacles, targets and "
         "plots. It needs no network. Several logs are shown together.",
     )
-    parser.add_argument(
-        "flights",
-        type=folder,
+    option(
+        parser,
+        "flights FLIGHT",
+        "a folder of `jaxdrones fly`, a run, or a log.npz; of several paths, others are skipped",
+        folder,
         nargs="+",
-        metavar="FLIGHT",
-        help="a folder of `jaxdrones fly`, a run, or a log.npz; of several paths, others are skipped",
     )
     page = parser.add_argument_group("page and output")
     filmed = parser.add_argument_group("film")
     add_output(page, "path of the page (flight.html beside the first log; history.html)", metavar="FILE")
-    page.add_argument(
-        "--others", default="ghosts", metavar="NAME", help=f"layout of further flights: {', '.join(LAYOUTS)} (ghosts)"
-    )
-    page.add_argument(
-        "--history", action="store_true", help="show the policies that a run of `train --keep-history` evaluated"
-    )
+    option(page, "--others NAME", f"layout of further flights: {', '.join(LAYOUTS)}", default="ghosts")
+    switch(page, "--history", "show the policies that a run of `train --keep-history` evaluated")
     page.add_argument("--title", help="title of the page (the conditions of the first flight)")
-    page.add_argument("--open", action="store_true", help="open the page in the browser")
-    filmed.add_argument("--video", type=folder, metavar="FILE", help="film of the page, .mp4 or .gif; needs Chromium")
-    filmed.add_argument("--camera", default="orbit", metavar="NAME", help=f"{', '.join(CAMERAS)} (orbit)")
-    filmed.add_argument("--size", default="1280x720", metavar="WxH", help="size, pixels (1280x720)")
-    filmed.add_argument("--fps", type=int, default=24, metavar="N", help="frames per second (24)")
-    parser.set_defaults(run=_view, ranges=dict(camera=choice("camera", CAMERAS), fps=whole()))
+    switch(page, "--open", "open the page in the browser")
+    option(filmed, "--video FILE", "film of the page, .mp4 or .gif; needs Chromium", folder)
+    option(filmed, "--camera NAME", ", ".join(CAMERAS), default="orbit", check=choice("camera", CAMERAS))
+    option(filmed, "--size WxH", "size, pixels", default="1280x720")
+    option(filmed, "--fps N", "frames per second", int, 24, check=whole())
+    parser.set_defaults(run=_view)
 
 
 def _view(options: argparse.Namespace) -> int:

@@ -29,7 +29,7 @@ def add(commands) -> None:
         "it by several controllers with the same set-points and print the errors of each. With --output draw paths "
         "and errors of all, too.",
     )
-    option(parser, "flight FLIGHT", ", ".join(FLIGHTS))
+    option(parser, "flight FLIGHT", "{}", known=FLIGHTS)
     add_conditions(parser)
     compared = parser.add_argument_group("comparison")
     files = parser.add_argument_group("files and output")

@@ -5,26 +5,10 @@ import functools
 from collections.abc import Iterator
 
 from jaxdrones.arguments import choice
-from jaxdrones.cli.export import TARGETS
-from jaxdrones.cli.names import known_names
 from jaxdrones.cli.options import option
-from jaxdrones.cli.settings import REALISTIC_KINDS
 from jaxdrones.errors import UserError, install
 
 SHELLS = ("bash", "zsh", "fish")
-_KINDS = {  # argument -> kind of its names
-    "task": "tasks",
-    "flight": "flights",
-    "vehicle": "vehicles",
-    "backend": "backends",
-    "controller": "controllers",
-    "rotors": "rotors",
-    "integrator": "integrators",
-    "algo": "algorithms",
-    "shell": "shells",
-    "realistic": "kinds",
-    "to": "targets",
-}
 _FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
 
 
@@ -39,7 +23,7 @@ def add(commands, root: argparse.ArgumentParser) -> None:
         "  zsh    jaxdrones completion zsh > ~/.zfunc/_jaxdrones     with ~/.zfunc in $fpath before compinit\n"
         "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
     )
-    option(parser, "shell SHELL", ", ".join(SHELLS), check=choice("shell", SHELLS))
+    option(parser, "shell SHELL", "{}", check=choice("shell", SHELLS), known=SHELLS)
     parser.set_defaults(run=functools.partial(_completion, root))
 
 
@@ -48,10 +32,9 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
         import shtab
     except ImportError:
         raise UserError(f"shtab is not installed; {install('cli')}") from None
-    names = known_names() | {"shells": SHELLS, "kinds": REALISTIC_KINDS, "targets": TARGETS}
     for action in _actions(root):
-        if action.dest in _KINDS:
-            action.choices = names[_KINDS[action.dest]]
+        if known := getattr(action, "known", ()):
+            action.choices = known
         elif action.metavar in (*_FOLDERS, *_FILES):
             vars(action)["complete"] = shtab.DIRECTORY if action.metavar in _FOLDERS else shtab.FILE
     print(shtab.complete(root, options.shell))

@@ -10,7 +10,7 @@ from jaxdrones.checks import look_up
 from jaxdrones.cli import fly
 from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.live import add_live
-from jaxdrones.cli.options import add_drones, add_output, add_set, option, switch
+from jaxdrones.cli.options import add_drones, add_output, add_set, add_task, option, switch
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import parse_settings
@@ -41,7 +41,7 @@ def add(commands) -> None:
         "whose code is executed; needs casadi",
         folder,
     )
-    option(parser, "--task TASK", "with file.py:name: task (hover), as for `jaxdrones train`")
+    add_task(parser, "with file.py:name: task (hover), as for `jaxdrones train`")
     add_set(parser, "with file.py:name: option of the environment (action, observation, ...)")
     add_drones(parser, 1)
     add_live(parser, "instead of the page, simulate FLIGHT and show it in the browser in real time")

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.metadata
+import operator
 import platform
 import re
 import shutil
@@ -13,12 +14,7 @@ from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError, install
 
 _LEFT_OUT = ("all", "dev", "docs")  # extras of extras, or for developers
-_COMPARISONS = {
-    "<=": lambda a, b: a <= b,
-    ">=": lambda a, b: a >= b,
-    "<": lambda a, b: a < b,
-    "==": lambda a, b: a == b,
-}
+_COMPARISONS = {"<=": operator.le, ">=": operator.ge, "<": operator.lt, "==": operator.eq}
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[^]]*\])?\s*\(?(?P<versions>[^;)]*)\)?\s*(;(?P<marker>.*))?")
 
 

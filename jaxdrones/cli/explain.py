@@ -16,7 +16,7 @@ def add(commands) -> None:
         description="Print a table of every entry of observation and action (name, unit, frame, range, meaning of -1, "
         "0 and 1), the rewards, the terminations, and the simulation of an environment.",
     )
-    option(parser, "task TASK", f"{', '.join(TASKS)}, or file.py:function")
+    option(parser, "task TASK", "{}, or file.py:function", known=TASKS)
     add_drones(parser)
     add_vehicle(parser)
     add_realistic(parser)

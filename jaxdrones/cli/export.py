@@ -23,7 +23,7 @@ def add(commands) -> None:
         "and outputs: order, unit, frame and range.",
     )
     add_drones(add_policy(parser))
-    option(parser, "--to TARGET", ", ".join(TARGETS), check=choice("target", TARGETS), required=True)
+    option(parser, "--to TARGET", "{}", check=choice("target", TARGETS), known=TARGETS, required=True)
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     switch(parser, "--last", "export the newest policy instead of the best")

@@ -23,7 +23,7 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     add_drones(group)
     add_vehicle(group, "cf2x")
     option(group, "--effects A,B", f"{', '.join(EFFECTS | PAIRS)}, or none")
-    option(group, "--controller NAME", f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    option(group, "--controller NAME", "{} (the vehicle's own)", known=CONTROLLERS)
     group.add_argument(
         "--feedforward",
         action=argparse.BooleanOptionalAction,
@@ -33,8 +33,8 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     )
     option(group, "--control-hz HZ", "control rate; physics runs at 240 Hz or above", int)
     option(group, "--duration S", "simulated time, s", float)
-    option(group, "--rotors NAME", ", ".join(ROTORS), default="instant")
-    option(group, "--integrator NAME", ", ".join(INTEGRATORS), default="semi_implicit_euler")
+    option(group, "--rotors NAME", "{}", default="instant", known=ROTORS)
+    option(group, "--integrator NAME", "{}", default="semi_implicit_euler", known=INTEGRATORS)
     option(group, "--seed K", "seed of a random start, 1 cm standard deviation, or of an episode", int, check=seed)
 
 

@@ -12,7 +12,7 @@ import jax
 from jaxdrones.cli.common import check_writable, folder, print_error
 from jaxdrones.cli.flight_options import CONDITIONS, add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
-from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set, option, switch
+from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set, add_task, option, switch
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
 from jaxdrones.cli.report import described, print_results, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
@@ -40,7 +40,7 @@ def add(commands) -> None:
         "A flight has diverged if at its end a drone is upside down, or its error is 1 m (or 1 m/s) larger than at\n"
         "the start. Files of an earlier flight in --output are replaced.",
     )
-    option(parser, "flight FLIGHT", ", ".join(FLIGHTS), nargs="?")
+    option(parser, "flight FLIGHT", "{}", known=FLIGHTS, nargs="?")
     add_conditions(parser)
     policy = parser.add_argument_group("policy")
     bullet = parser.add_argument_group("backend")
@@ -53,16 +53,15 @@ def add(commands) -> None:
         "example forest; any-vehicle or raptor; or file.py:name, whose code is executed",
         folder,
     )
-    option(policy, "--task TASK", "with file.py:name, any-vehicle or raptor: task, as for `jaxdrones train`")
+    add_task(policy, "with file.py:name, any-vehicle or raptor: task, as for `jaxdrones train`")
     add_realistic(policy, "with file.py:name: ")
     add_set(policy, "with file.py:name: option of the environment (action, observation, ...)")
     add_backend(bullet)
     switch(bullet, "--obstacles", "add the obstacles of gym-pybullet-drones (2021) (bullet)")
     switch(bullet, "--gui", "show Bullet's window, with motor sliders (bullet)")
     option(shown, "--video FILE", "film of the flight, .mp4 or .gif", folder)
-    option(
-        shown, "--renderer NAME", f"of the film: {', '.join(films.RENDERERS)} (page if Chromium is installed, else jax)"
-    )
+    chosen = "of the film: {} (page if Chromium is installed, else jax)"
+    option(shown, "--renderer NAME", chosen, known=films.RENDERERS)
     add_live(shown, "show the flight in the browser in real time")
     switch(shown, "--cameras", "write the images of each drone's camera as PNG and into the log")
     add_output(files, "folder of log and figure (runs/FLIGHT, RUN/flight)")

@@ -1,23 +1,37 @@
 """Options shared by several commands, with one meaning and one help text each."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.arguments import Check, choice, whole
 from jaxdrones.cli.common import folder
+from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 
 
 def option(
-    group, name: str, text: str, kind: Any = str, default: Any = None, check: Check | None = None, **more: Any
+    group,
+    name: str,
+    text: str,
+    kind: Any = str,
+    default: Any = None,
+    check: Check | None = None,
+    known: Iterable[str] = (),
+    **more: Any,
 ) -> None:
-    """Add an option or argument such as `--speed X`, with its default in the help, and the range of its values."""
+    """Add an option or argument such as `--speed X`, with its default in the help, and the range of its values.
+
+    The `known` names take the place of `{}` in the help, and complete the option in a shell.
+    """
     flag, _, metavar = name.partition(" ")
+    text = text.replace("{}", ", ".join(known))
     if type(default) in (str, int, float):
         text += f" ({default:g})" if isinstance(default, float) else f" ({default})"
     added = group.add_argument(flag, type=kind, default=default, metavar=metavar, help=text, **more)
+    vars(added)["known"] = list(known)
     if check is not None:
         group.set_defaults(ranges=(group.get_default("ranges") or {}) | {added.dest: check})
 
@@ -34,13 +48,18 @@ def add_drones(group, default: int | None = None) -> None:
 
 def add_vehicle(group, default: str | None = None, where: str = "") -> None:
     """Add --vehicle; `default` is `None` where the recipe of a run has the vehicle."""
-    text = f"{where}{', '.join(assets.vehicles())} or a .urdf file"
-    option(group, "--vehicle NAME|URDF", text + " (cf2x)" * (default is None), default=default)
+    text = f"{where}{{}} or a .urdf file" + " (cf2x)" * (default is None)
+    option(group, "--vehicle NAME|URDF", text, default=default, known=assets.vehicles())
 
 
 def add_backend(group) -> None:
     """Add --backend."""
-    option(group, "--backend NAME", ", ".join(BACKENDS), default="explicit", check=choice("backend", BACKENDS))
+    option(group, "--backend NAME", "{}", default="explicit", check=choice("backend", BACKENDS), known=BACKENDS)
+
+
+def add_task(group, text: str) -> None:
+    """Add --task."""
+    option(group, "--task TASK", text, known=TASKS)
 
 
 def add_set(group, text: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from jaxdrones import assets
 from jaxdrones.checks import hint
 from jaxdrones.cli.common import folder, run_folder
-from jaxdrones.cli.options import add_set, add_vehicle, option
+from jaxdrones.cli.options import add_set, add_task, add_vehicle, option
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic
 from jaxdrones.errors import UserError
@@ -47,7 +47,7 @@ def add_policy(parser: argparse.ArgumentParser, others: str = "") -> argparse._A
         folder,
     )
     own = parser.add_argument_group("your own policy", "only for a policy that is not a run")
-    option(own, "--task TASK", "task of the policy, as for `jaxdrones train`")
+    add_task(own, "task of the policy, as for `jaxdrones train`")
     add_vehicle(own)
     add_realistic(own)
     add_set(own, "option of the environment (action, observation, ...)")

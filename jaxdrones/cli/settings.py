@@ -32,6 +32,7 @@ def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
         "of 20 g to 3 kg in every episode",
         _kind,
         False,
+        known=REALISTIC_KINDS,
         nargs="?",
         const=True,
     )

@@ -66,7 +66,7 @@ def add(commands) -> None:
         "evaluated or flown: open only runs that you trust.",
         epilog=_HOSTS_HELP,
     )
-    option(parser, "task TASK", f"{', '.join(TASKS)}; or file.py:function, a function that returns a task")
+    option(parser, "task TASK", "{}; or file.py:function, a function that returns a task", known=TASKS)
     task = parser.add_argument_group("task and learner")
     schedule = parser.add_argument_group("schedule")
     files = parser.add_argument_group("files and output")
@@ -74,7 +74,7 @@ def add(commands) -> None:
     add_drones(task)
     add_vehicle(task)
     add_realistic(task)
-    option(task, "--algo NAME", f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
+    option(task, "--algo NAME", "{} (bptt; gates: ppo)", known=ALGORITHMS)
     add_set(
         task, "setting of the learner (worlds, horizon, learning_rate) or option of the environment (period, action)"
     )

@@ -14,29 +14,16 @@ import numpy as np
 
 from jaxdrones.errors import install
 
-MESSAGES = (
-    "builtin_interfaces/msg/Time",
-    "geometry_msgs/msg/Point",
-    "geometry_msgs/msg/Pose",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovariance",
-    "geometry_msgs/msg/Quaternion",
-    "geometry_msgs/msg/Twist",
-    "geometry_msgs/msg/TwistStamped",
-    "geometry_msgs/msg/TwistWithCovariance",
-    "geometry_msgs/msg/Vector3",
-    "nav_msgs/msg/Odometry",
-    "rosgraph_msgs/msg/Clock",
-    "sensor_msgs/msg/BatteryState",
-    "sensor_msgs/msg/CameraInfo",
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/Imu",
-    "sensor_msgs/msg/RegionOfInterest",
-    "std_msgs/msg/Float64MultiArray",
-    "std_msgs/msg/Header",
-    "std_msgs/msg/MultiArrayDimension",
-    "std_msgs/msg/MultiArrayLayout",
-)
+_NAMES = {
+    "builtin_interfaces": "Time",
+    "geometry_msgs": "Point Pose PoseStamped PoseWithCovariance Quaternion Twist TwistStamped TwistWithCovariance "
+    "Vector3",
+    "nav_msgs": "Odometry",
+    "rosgraph_msgs": "Clock",
+    "sensor_msgs": "BatteryState CameraInfo Image Imu RegionOfInterest",
+    "std_msgs": "Float64MultiArray Header MultiArrayDimension MultiArrayLayout",
+}
+MESSAGES = tuple(f"{package}/msg/{name}" for package, names in _NAMES.items() for name in names.split())
 """Names of all message types."""
 
 Message = Any

@@ -16,14 +16,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import Switch, checked, whole
-from jaxdrones.checks import (
-    check_finite,
-    check_quaternion,
-    check_shape,
-    is_concrete,
-    look_up,
-    short_repr,
-)
+from jaxdrones.checks import check_finite, check_quaternion, check_shape, is_concrete, look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.distances import Surface, as_floats, distance_of, merged, nearest_few_of, nearest_of, touched_of

@@ -16,14 +16,7 @@ PANELS = {
     "evaluated_error": "median final error (m), evaluated",
 }
 _MEDIAN, _BAND = COLORS[-1], "#b4bac1"
-_STAR: dict[str, Any] = {
-    "marker": "*",
-    "markersize": 18,
-    "color": "#f2b705",
-    "markeredgecolor": "black",
-    "zorder": 5,
-    "clip_on": False,
-}
+_STAR: Any = dict(marker="*", markersize=18, color="#f2b705", markeredgecolor="black", zorder=5, clip_on=False)
 _INTERVAL: dict[str, Any] = {"linestyle": "none", "ecolor": _MEDIAN, "elinewidth": 1.2, "capsize": 5, "capthick": 1.2}
 _GRID = 400
 _MOST_NAMED = 7  # runs with their own lines and names

@@ -17,13 +17,7 @@ MOST_NAMED = 12  # drones with a line in the legend each; paths of more are thin
 _MOST_OBSTACLES = 400
 _CORNERS = 180  # of the outline of an obstacle
 OUTLINE: dict[str, Any] = {"facecolor": "#c9ced3", "edgecolor": "#9aa1a8", "linewidth": 0.8, "zorder": 0}
-START: dict[str, Any] = {
-    "marker": "o",
-    "markersize": 7,
-    "markerfacecolor": "white",
-    "markeredgewidth": 1.8,
-    "linestyle": "none",
-}
+START: Any = dict(marker="o", markersize=7, markerfacecolor="white", markeredgewidth=1.8, linestyle="none")
 _GOAL: dict[str, Any] = {"marker": "x", "markersize": 9, "markeredgewidth": 2.2, "linestyle": "none"}
 END: dict[str, Any] = {"marker": "o", "markersize": 7, "linestyle": "none"}
 ENDS = {"start": START, "end": END}

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import envs
 from jaxdrones.adapters import jax_spaces
-from jaxdrones.adapters.jax_spaces import Spaces, action_table, of_gymnasium
+from jaxdrones.adapters.jax_spaces import Spaces, action_space, of_gymnasium
 from jaxdrones.adapters.session import rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs.autoreset import Episode
@@ -74,12 +74,8 @@ class GymnaxEnv:
         self.env, self._rewarding = env, rewarding(team_reward)
         self._separate_truncation = separate_truncation
         self._layout = Layout(env, None)
-        size = env.drones * env.action_size
-        self._table = None if discrete_actions is None else action_table(discrete_actions, size)
+        self._table, self._action_space = action_space(discrete_actions, env.drones * env.action_size, spaces)
         self._observation_space = of_gymnasium(_flat_space(self._layout.observation), spaces)
-        self._action_space = (
-            spaces.Box(-1.0, 1.0, (size,)) if self._table is None else spaces.Discrete(len(self._table))
-        )
 
     @property
     def name(self) -> str:

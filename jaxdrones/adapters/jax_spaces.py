@@ -75,8 +75,10 @@ def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
     return spaces.Box(jnp.asarray(space.low), jnp.asarray(space.high), space.shape, space.dtype)
 
 
-def action_table(discrete_actions: Any, size: int) -> Float[Array, "k a"]:
-    """Validated table of discrete actions, one per row."""
+def action_space(discrete_actions: Any, size: int, spaces: Spaces) -> tuple[Float[Array, "k a"] | None, Any]:
+    """Validated table of discrete actions, one per row, and their space; or `None` and the space of continuous ones."""
+    if discrete_actions is None:
+        return None, spaces.Box(-1.0, 1.0, (size,))
     table = np.asarray(discrete_actions, np.float32)
     check_shape("discrete_actions", table, ("k", size), "one row for every discrete action", finite=True)
-    return jnp.asarray(table)
+    return jnp.asarray(table), spaces.Discrete(len(table))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import envs
 from jaxdrones.adapters import jax_spaces
-from jaxdrones.adapters.jax_spaces import Spaces, action_table, of_gymnasium
+from jaxdrones.adapters.jax_spaces import Spaces, action_space, of_gymnasium
 from jaxdrones.adapters.spaces import Layout, observation_of_drone
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.vision import observation
@@ -60,8 +60,7 @@ class JaxMARLEnv:
         self.agent_classes = {"drones": self.agents}
         self._episodes, self._layout = envs.AutoReset(env), Layout(env, self.agents)
         self._with_world_state = world_state
-        self._table = None if discrete_actions is None else action_table(discrete_actions, env.action_size)
-        action = spaces.Box(-1.0, 1.0, (env.action_size,)) if self._table is None else spaces.Discrete(len(self._table))
+        self._table, action = action_space(discrete_actions, env.action_size, spaces)
         self.observation_spaces = dict.fromkeys(self.agents, of_gymnasium(observation_of_drone(env), spaces))
         self.action_spaces = dict.fromkeys(self.agents, action)
 

@@ -67,8 +67,11 @@ def add(commands) -> None:
 def _run(options: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
     if options.build:
-        there = options.if_missing and _is_built()
-        say(f"{betaflight.find_program()} exists" if there else f"built {build(say)}")
+        with contextlib.suppress(UserError):  # there is none
+            if options.if_missing:
+                say(f"{betaflight.find_program()} exists")
+                return 0
+        say(f"built {build(say)}")
         return 0
     if options.if_missing:
         raise UserError("--if-missing is given without --build; give both or none")
@@ -125,14 +128,6 @@ def _check(options: argparse.Namespace) -> None:
         )
     options.target = _numbers("target", options.target, 3, float)
     options.axes = _numbers("axes", options.axes, 4, int)
-
-
-def _is_built() -> bool:
-    try:
-        betaflight.find_program()
-    except UserError:
-        return False
-    return True
 
 
 def _numbers(name: str, text: str, count: int, kind: Callable[[str], Any]) -> tuple[Any, ...]:

@@ -10,28 +10,8 @@ from jaxdrones.flights.preparation import inconsistencies, load_flights, prepare
 from jaxdrones.flights.report import errors_as_dict
 from jaxdrones.flights.vehicle import Instruments, Vehicle, load_vehicle
 
-__all__ = [
-    "HORIZONS",
-    "PARAMETERS",
-    "QUANTITIES",
-    "ClosedLoopResult",
-    "Estimate",
-    "FlightLog",
-    "ImageSequence",
-    "Instruments",
-    "LoggedConditions",
-    "Report",
-    "Vehicle",
-    "errors_as_dict",
-    "fit",
-    "hold_errors",
-    "inconsistencies",
-    "load_flights",
-    "load_vehicle",
-    "open_loop_errors",
-    "prepare",
-    "read_log",
-    "save_csv",
-    "save_npz",
-    "simulate_closed_loop",
-]
+__all__ = ["FlightLog", "ImageSequence", "LoggedConditions", "inconsistencies", "load_flights", "prepare"]
+__all__ += ["read_log", "save_csv", "save_npz"]
+__all__ += ["PARAMETERS", "Estimate", "Instruments", "Report", "Vehicle", "fit", "load_vehicle"]
+__all__ += ["HORIZONS", "QUANTITIES", "ClosedLoopResult", "errors_as_dict"]
+__all__ += ["hold_errors", "open_loop_errors", "simulate_closed_loop"]

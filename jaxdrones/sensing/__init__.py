@@ -26,53 +26,10 @@ from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 from jaxdrones.sensing.urdf_scene import from_urdf
 
-__all__ = [
-    "BEAMS",
-    "BMI088",
-    "BMP388",
-    "EUROPE",
-    "LIS3MDL",
-    "MPU9250",
-    "PERFECT",
-    "VICON",
-    "Box",
-    "Camera",
-    "Capsule",
-    "Collisions",
-    "Cylinder",
-    "DepthNoise",
-    "Images",
-    "ImuPart",
-    "Mesh",
-    "MotionCaptureSystem",
-    "Noise",
-    "Scene",
-    "Sensor",
-    "Sphere",
-    "Surface",
-    "Urdf",
-    "allan_deviation",
-    "barometer",
-    "camera_2021",
-    "collisions",
-    "downward_range",
-    "forest",
-    "from_urdf",
-    "gate",
-    "imu",
-    "kalman",
-    "lidar",
-    "magnetometer",
-    "motion_capture",
-    "multi_ranger",
-    "obstacles_2021",
-    "optical_flow",
-    "photograph",
-    "range_finder",
-    "ray",
-    "render",
-    "room",
-    "state_estimate",
-    "time_of_flight",
-    "track",
-]
+__all__ = ["Box", "Capsule", "Cylinder", "Mesh", "Scene", "Sphere", "Surface", "Urdf"]
+__all__ += ["BEAMS", "forest", "from_urdf", "gate", "obstacles_2021", "room", "track"]
+__all__ += ["Camera", "Collisions", "DepthNoise", "Images", "camera_2021", "collisions", "photograph", "render"]
+__all__ += ["downward_range", "lidar", "multi_ranger", "optical_flow", "range_finder", "ray", "time_of_flight"]
+__all__ += ["BMI088", "BMP388", "EUROPE", "LIS3MDL", "MPU9250", "PERFECT", "VICON"]
+__all__ += ["ImuPart", "Noise", "Sensor", "allan_deviation", "barometer", "imu", "magnetometer"]
+__all__ += ["MotionCaptureSystem", "kalman", "motion_capture", "state_estimate"]

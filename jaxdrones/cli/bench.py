@@ -40,7 +40,7 @@ def add(commands) -> None:
         "an environment, without compilation. The last line is a summary to share.",
     )
     counts = "numbers of worlds (1024,16384; more on an accelerator)"
-    option(parser, "--worlds N,N", counts, _counts, check=_check_worlds)
+    option(parser, "--worlds N,N", counts, _counts, check=arguments.sequence("1024", arguments.count))
     option(parser, "--seconds S", "time limit, s", float, 25.0, check=arguments.number("s", above=0))
     parser.set_defaults(run=_bench)
 
@@ -50,11 +50,6 @@ def _counts(text: str) -> list[int]:
         return [int(count) for count in text.split(",")]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is given; give whole numbers, for example 1024,16384") from None
-
-
-def _check_worlds(name: str, worlds: list[int]) -> None:
-    for each in worlds:
-        arguments.count(name, each)
 
 
 def _bench(options: argparse.Namespace) -> int:

@@ -46,7 +46,9 @@ def _doctor(options: argparse.Namespace) -> int:
     folder = machine.program_folder()
     sizes = [path.stat().st_size for path in folder.glob("*-cache")]
     result["programs"] = {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
-    result |= {"devices": devices, "notes": _notes(devices), "extras": present, "self_test": tests, "wrong": wrong}
+    slow = bool(devices and shutil.which("nvidia-smi")) and all(device.startswith("cpu") for device in devices)
+    notes = ['an NVIDIA driver is installed, but jax uses the CPU; pip install "jax[cuda12]" for the GPU'] * slow
+    result |= {"devices": devices, "notes": notes, "extras": present, "self_test": tests, "wrong": wrong}
     print_results(options, result, _text(result))
     return 1 if wrong else 0
 
@@ -125,12 +127,6 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Release numbers of a version, without suffixes such as `rc1`."""
     found = re.match(r"\d+(\.\d+)*", version)
     return tuple(map(int, found[0].split("."))) if found else ()
-
-
-def _notes(devices: list[str]) -> list[str]:
-    if devices and shutil.which("nvidia-smi") and all(device.startswith("cpu") for device in devices):
-        return ['an NVIDIA driver is installed, but jax uses the CPU; pip install "jax[cuda12]" for the GPU']
-    return []
 
 
 def _self_tests(extras: dict[str, dict[str, Any]], wrong: list[str]) -> dict[str, str]:

@@ -167,11 +167,14 @@ def show_results(request: Request, runs: dict) -> int:
         return 0
     for seed, report in reports.items():
         spent = report["seconds"]
+        early = ""
+        if report["stopped_at_success"]:
+            early = f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"
         if len(runs) > 1:
             print(f"seed {seed}:")
         print(
             f"trained in {spent['training']:.1f} s, {spent['training'] + spent['compiling']:.1f} s with compiling; "
-            f"{spent['evaluating']:.1f} s for evaluations{_early(run, report)}. The best policy is that of update "
+            f"{spent['evaluating']:.1f} s for evaluations{early}. The best policy is that of update "
             f"{report['best_update']}:"
         )
         print(evaluation_table(report["evaluation"]))
@@ -179,9 +182,3 @@ def show_results(request: Request, runs: dict) -> int:
     print(f"fly it: jaxdrones fly --policy {output}")
     warn_of_failure(run, reports[best])
     return 0
-
-
-def _early(run, report: dict[str, Any]) -> str:
-    if not report["stopped_at_success"]:
-        return ""
-    return f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"

@@ -109,7 +109,8 @@ def fit(
     motors = motors or crazyflie_motors()
     if not named and all(log.has("target_pos", "pwm") for log in logs):
         return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
-    names = parameters.select_parameters(names) if named else parameters.default_parameters(kinds.pop())
+    default = parameters.FROM_ROTOR_SPEEDS if kinds.pop() else parameters.FROM_PWM
+    names = parameters.select_parameters(names) if named else default
     return _Problem(logs, params, names, motors).solve(validate, named, progress)
 
 

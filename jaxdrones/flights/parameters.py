@@ -69,13 +69,9 @@ PARAMETERS = {
 _CLOSED_LOOP_ONLY = ("rotor_lag", "unfelt_sag", "estimate_tilt", "estimate_delay")
 # Only the ratios of thrust to mass and of yaw torque to inertia are identifiable: one parameter of each is fixed.
 # PWM identifies thrusts, not rotor speeds.
-_FROM_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_CLOSED_LOOP_ONLY))
-_FROM_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_CLOSED_LOOP_ONLY))
-
-
-def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
-    """Names of the parameters of a fit by default."""
-    return _FROM_ROTOR_SPEEDS if has_rotor_speeds else _FROM_PWM
+FROM_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_CLOSED_LOOP_ONLY))
+FROM_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_CLOSED_LOOP_ONLY))
+"""Names of the parameters of a fit by default."""
 
 
 def select_parameters(names: Sequence[str]) -> tuple[str, ...]:

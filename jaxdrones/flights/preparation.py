@@ -16,9 +16,16 @@ _MAX_GAP = 0.05  # s
 _MAX_JITTER = 0.5e-3  # s, tolerance of times at 100 Hz without resampling
 _MIN_ROWS = 100
 _FULL_PWM = 65535
-_MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
-_MIN_VOLTAGE, _MAX_VOLTAGE = 1.0, 60.0  # V
-_MAX_RPM = 1e6
+_PLAUSIBLE = (  # columns, lowest and highest number, what numbers beyond look like, and what to give
+    (("omega",), -60.0, 60.0, "degrees/s", "rad/s"),  # gyroscopes of small quadrotors saturate at 35
+    (("target_yaw",), -4 * np.pi, 4 * np.pi, "degrees", "rad"),
+    (("vel", "target_vel"), -100.0, 100.0, "mm/s or cm/s", "m/s"),
+    (("pos", "target_pos"), -1e4, 1e4, "mm", "m"),
+    (("vbat",), -np.inf, 60.0, "millivolts", "V"),
+    (("vbat",), 1.0, np.inf, "a voltage too low for motors", "V"),
+    (("pwm",), 0.0, _FULL_PWM, "numbers beyond 16-bit duty cycles", "0 to 65535"),
+    (("rpm",), 0.0, 1e6, "numbers beyond rotor speeds", "RPM"),
+)
 _MIN_MEDIAN_RPM = 2700.0  # lowest median speed of small quadrotors; 16,000 RPM are 1,700 rad/s
 _MIN_PEAK_PWM = 0.1 * _FULL_PWM  # no quadrotor flies below a tenth of the duty cycle
 
@@ -149,24 +156,13 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
             low, high = np.min(x), np.max(x)
             raise UserError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
 
-    largest = np.max(np.abs(x))
+    for columns, low, high, looks, give in _PLAUSIBLE:
+        if column in columns:
+            require(low <= np.min(x) and np.max(x) <= high, looks, give)
     if column == "quat":
         length = np.linalg.norm(x, axis=-1)
         require(np.all(np.abs(length - 1) < 0.05), f"quaternions of length {length[0, 0]:.4g}, not 1", "x, y, z, w")
-    elif column == "omega":
-        require(largest <= _MAX_RATE, "degrees/s", "rad/s")
-    elif column == "target_yaw":
-        require(largest <= 4 * np.pi, "degrees", "rad")
-    elif column in ("vel", "target_vel"):
-        require(largest <= 100, "mm/s or cm/s", "m/s")
-    elif column in ("pos", "target_pos"):
-        require(largest <= 1e4, "mm", "m")
-    elif column == "vbat":
-        require(largest <= _MAX_VOLTAGE, "millivolts", "V")
-        require(np.min(x) >= _MIN_VOLTAGE, "a voltage too low for motors", "V")
     elif column == "pwm":
-        require(0 <= np.min(x) and largest <= _FULL_PWM, "numbers beyond 16-bit duty cycles", "0 to 65535")
-        require(largest > _MIN_PEAK_PWM, "percent, 8 bits or microseconds", "0 to 65535")
+        require(np.max(x) > _MIN_PEAK_PWM, "percent, 8 bits or microseconds", "0 to 65535")
     elif column == "rpm":
-        require(0 <= np.min(x) and largest <= _MAX_RPM, "numbers beyond rotor speeds", "RPM")
         require(np.median(x) >= _MIN_MEDIAN_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

@@ -44,7 +44,7 @@ def state_messages(now: Measurement, i: int, ns: int) -> dict[str, msg.Message]:
 
     Motor speeds have no stamp. They precede the odometry, so a receiver of the odometry has them.
     """
-    world, body = msg.Header(stamp(ns), topics.WORLD), msg.Header(stamp(ns), topics.body_frame(i))
+    world, body = msg.Header(stamp(ns), topics.WORLD), msg.Header(stamp(ns), f"{topics.drone(i)}/base_link")
     orientation = msg.Quaternion(*now.quat[i].tolist())
     omega = msg.Vector3(*now.omega[i].tolist())
     pose = msg.Pose(msg.Point(*now.pos[i].tolist()), orientation)
@@ -95,7 +95,7 @@ def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
 
 def image_messages(rgb: np.ndarray, camera: Camera, i: int, ns: int) -> dict[str, msg.Message]:
     """Messages of the image (h, w, 4) of the camera of drone `i` and of its calibration."""
-    header = msg.Header(stamp(ns), topics.optical_frame(i))
+    header = msg.Header(stamp(ns), f"{topics.drone(i)}/camera_optical_frame")
     height, width = rgb.shape[:2]
     pixels = np.ascontiguousarray(rgb[..., :3])
     image = msg.Image(header, height, width, "rgb8", step=3 * width, data=pixels.tobytes())

@@ -64,18 +64,8 @@ COMMANDS = {
 
 
 def drone(i: int) -> str:
-    """Name of a drone, the namespace of its topics."""
+    """Name of a drone, the namespace of its topics and frames: `base_link` and `camera_optical_frame`."""
     return f"drone_{i}"
-
-
-def body_frame(i: int) -> str:
-    """Frame of the body of a drone: x forward, y left, z up."""
-    return f"{drone(i)}/base_link"
-
-
-def optical_frame(i: int) -> str:
-    """Frame of the images of a drone: x right, y down, z forward."""
-    return f"{drone(i)}/camera_optical_frame"
 
 
 def output(i: int, name: str) -> Topic:

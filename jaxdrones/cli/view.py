@@ -15,8 +15,7 @@ from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
 from jaxdrones.training.history import fly_history
-from jaxdrones.visualization import video
-from jaxdrones.visualization.viewer.film import CAMERAS, film
+from jaxdrones.visualization import films, video
 from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.show import LAYOUTS, show, show_history
 
@@ -44,7 +43,7 @@ def add(commands) -> None:
     page.add_argument("--title", help="title of the page (the conditions of the first flight)")
     switch(page, "--open", "open the page in the browser")
     option(filmed, "--video FILE", "film of the page, .mp4 or .gif; needs Chromium", folder)
-    option(filmed, "--camera NAME", "{}", default="orbit", check=choice("camera", CAMERAS), known=CAMERAS)
+    option(filmed, "--camera NAME", "{}", default="orbit", check=choice("camera", films.CAMERAS), known=films.CAMERAS)
     option(filmed, "--size WxH", "size, pixels", default="1280x720")
     option(filmed, "--fps N", "frames per second", int, 24, check=whole())
     parser.set_defaults(run=_view)
@@ -87,7 +86,7 @@ def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[st
     page.save(output)
     files = [output]
     if options.video:
-        film(page, options.video, options.fps, options.size, options.camera)
+        films.film_page(page, options.video, options.fps, options.size, options.camera)
         files.append(options.video)
     if options.open:
         webbrowser.open(files[0].absolute().as_uri())

@@ -1,6 +1,8 @@
-"""Films of recorded flights, by the viewer's page in a browser or by the JAX renderer."""
+"""Films of recorded flights and of pages, by the viewer's page in a browser or by the JAX renderer."""
 
 import contextlib
+import io
+import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,14 @@ from jaxdrones.checks import check_choice
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import video
-from jaxdrones.visualization.browser import find_browser
-from jaxdrones.visualization.shots import shoot
+from jaxdrones.visualization.browser import Tab, find_browser, open_tab
+from jaxdrones.visualization.shots import Shot, shoot
+from jaxdrones.visualization.viewer import Page, show
 
 RENDERERS = ("page", "jax", "bullet")
 """Renderers of films: the viewer's page in Chromium, the JAX renderer, or Bullet's TinyRenderer."""
+CAMERAS = ("orbit", "follow", "board")
+"""Cameras of the page."""
 FPS = 24
 SIZE = (1280, 720)
 
@@ -69,10 +74,8 @@ def film(
 
 def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     if renderer == "page":
-        from jaxdrones.visualization.viewer import film, show
-
         shot = shoot(record, fps, size[0] / size[1])
-        return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
+        return page_frames(show(record, scene=shot.scene, title=title), fps, size, shot)
     if renderer == "jax":
         from jaxdrones.visualization import drawn_film  # needs Pillow
 
@@ -80,3 +83,53 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
     from jaxdrones.visualization import replay  # needs pybullet
 
     return replay.frames(record, title, fps, size)
+
+
+def film_page(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit") -> int:
+    """Write a film of a page, one frame per 1/fps of simulated time, in a few tenths of a second each.
+
+    Args:
+        page: result of `show`, or of `show_history`, whose policies fly one after the other.
+        path: path of the film, .mp4 or .gif.
+        fps: frames per second.
+        size: width and height, pixels; even numbers.
+        camera: `orbit` shows the whole flight, `follow` the first drone, `board` its own view.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ValueError: an unknown suffix, a package that is not installed, or no browser.
+        OSError: the film cannot be written.
+    """
+    video.check_video(path)
+    with contextlib.closing(page_frames(page, fps, size, camera)) as pictures:
+        return video.write(pictures, path, fps)
+
+
+def page_frames(page: Page, fps: int, size: tuple[int, int], camera: str | Shot) -> Generator[np.ndarray]:
+    """Frames (height, width, 3) uint8 of a film of a page, by one of its cameras or by a given one."""
+    from PIL import Image  # of the extra `video`
+
+    with open_tab() as tab, tempfile.TemporaryDirectory() as folder:
+        tab.open(page.save(Path(folder) / "page.html"), *size)
+        for script in _scripts(tab, fps, camera):
+            tab.run(script)
+            with Image.open(io.BytesIO(tab.screenshot())) as picture:
+                yield np.asarray(picture.convert("RGB"))
+
+
+def _scripts(tab: Tab, fps: int, camera: str | Shot) -> Iterator[str]:
+    """Scripts that draw the frames; the page of a training shows one policy after the other."""
+    if isinstance(camera, Shot):
+        tab.run(f"jaxdrones.film('orbit', {camera.scale:g})")
+        for k, (eye, target) in enumerate(zip(camera.eyes, camera.targets, strict=True)):
+            yield f"jaxdrones.frameAt({k / fps}, {1 / fps}, {eye.tolist()}, {target.tolist()})"
+        return
+    tab.run(f"jaxdrones.film({camera!r})")
+    policies = tab.run("jaxdrones.player.history ? jaxdrones.player.worlds.length : 0")
+    for policy in range(policies or 1):
+        if policies:
+            tab.run(f"jaxdrones.player.chooseWorld({policy})")
+        for k in range(max(1, round(tab.run("jaxdrones.player.end") * fps))):
+            yield f"jaxdrones.frameAt({k / fps}, {1 / fps})"

@@ -15,10 +15,10 @@ from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import obstacles_2021
 from jaxdrones.visualization import browser
+from jaxdrones.visualization.films import film_page
 from jaxdrones.visualization.overlay import Lens
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
 from jaxdrones.visualization.viewer import show
-from jaxdrones.visualization.viewer.film import film
 from jaxdrones.visualization.viewer.live import Live
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")]
@@ -102,7 +102,7 @@ def test_images_of_the_cameras_are_shown_as_they_were_recorded(record, tmp_path)
 def test_a_film_of_the_page_has_the_size_that_is_asked_for_and_moves(record, tmp_path):
     import imageio_ffmpeg
 
-    assert film(show(record), tmp_path / "flight.mp4", fps=4, size=(320, 180)) == 8
+    assert film_page(show(record), tmp_path / "flight.mp4", fps=4, size=(320, 180)) == 8
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "flight.mp4"))
     assert next(frames)["size"] == (320, 180)
     pictures = [np.frombuffer(frame, np.uint8).astype(int) for frame in frames]

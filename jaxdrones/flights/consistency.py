@@ -6,7 +6,7 @@ thrust along body z, and the angular acceleration follows the motors. A test nee
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -102,33 +102,32 @@ def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]
     return found
 
 
-def _failures(motion: Motion) -> list[str]:
+def _failures(motion: Motion) -> Iterator[str]:
+    """Contradictions of the axes, the one that is found fastest first."""
     pos, attitude, vel, omega = motion
-    found = []
     if not (test := shift_test(pos, vel)).passes:
-        found.append(f"vel is not the derivative of pos (misfit {test.misfit:.2f} of 1)")
+        yield f"vel is not the derivative of pos (misfit {test.misfit:.2f} of 1)"
     elif (correlation := climb_correlation(pos, vel)) < _MIN_CLIMB_CORRELATION:
-        found.append(f"z of vel is not the derivative of that of pos (correlation {correlation:.2f})")
+        yield f"z of vel is not the derivative of that of pos (correlation {correlation:.2f})"
     if not (test := turn_test(attitude, omega)).passes:
-        found.append(f"omega is not the rate of quat (misfit {test.misfit:.2f} of 1)")
+        yield f"omega is not the rate of quat (misfit {test.misfit:.2f} of 1)"
     force = force_test(vel, attitude)
     axes = [force._replace(has=force.has[:, i : i + 1], implied=force.implied[:, i : i + 1]) for i in range(2)]
     if not all(axis.passes for axis in axes):
         misfit = max(axis.misfit for axis in axes if not axis.passes)
-        found.append(f"the acceleration does not follow the tilt of the thrust (misfit {misfit:.2f} of 1)")
+        yield f"the acceleration does not follow the tilt of the thrust (misfit {misfit:.2f} of 1)"
     up = np.mean(attitude.apply([0, 0, 1.0])[:, 2]) if len(pos) else 1.0
     if up < _MIN_UP:
-        found.append(f"body z points down or sideways (mean cosine of the tilt {up:.2f})")
-    return found
+        yield f"body z points down or sideways (mean cosine of the tilt {up:.2f})"
 
 
 def _check_axes(logged: Motion) -> tuple[list[str], Motion]:
     """Failures with the simplest explanation by other conventions of columns, and the columns in these."""
-    failures = _failures(logged)
+    failures = list(_failures(logged))
     if not failures:
         return [], logged
     for causes, motion in _readings(logged):
-        if not _failures(motion):
+        if next(_failures(motion), None) is None:
             return [f"{'; '.join(failures)}: {' and '.join(causes)}"], motion
     hint = ": vel has another unit, or belongs to other positions, axes or times" if "vel" in failures[0] else ""
     return ["; ".join(failures) + hint], logged

@@ -38,6 +38,17 @@ def test_many_drones_are_three_rows():
     assert "-" in table(summary([row | {"settled_after_s": None} for row in rows]))
 
 
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [("betaflight", ("(racer)", "(0,0,1.5)", "(1000)", "(30)")), ("fly", ("(cf2x)", "(explicit)", "(instant)"))],
+)
+def test_the_help_shows_the_defaults_of_a_command(command, defaults, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([command, "--help"])
+    shown = capsys.readouterr().out
+    assert all(default in shown for default in defaults) and "None" not in shown and "[]" not in shown
+
+
 @pytest.mark.slow
 def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
     assert main(["fly", "downwash", "--duration", "0.2", "--json", "--output", str(tmp_path)]) == 0

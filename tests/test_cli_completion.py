@@ -44,6 +44,9 @@ def completed(script: str, words: str) -> list[str]:
         ("jaxdrones train hover --realistic a", ["any"]),
         ("jaxdrones export runs/hover --to st", ["stablehlo"]),
         ("jaxdrones completion f", ["fish"]),
+        ("jaxdrones eval mine.py:policy --task swap", ["swap-goals"]),
+        ("jaxdrones view runs/circle --camera f", ["follow"]),
+        ("jaxdrones ros2 --failsafe l", ["land"]),
     ],
 )
 def test_bash_completes(words, proposed, script):

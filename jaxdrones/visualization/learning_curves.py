@@ -37,14 +37,20 @@ def save_curves(
     """
     from matplotlib.ticker import EngFormatter
 
+    best = {
+        run: row for run, rows in histories.items() for row in rows if kept and row.get("update") == kept.get(run, "")
+    }
+    tints = dict(zip(histories, _tints(len(histories)), strict=True))
     with style.figure(13, 9) as figure:
         axes = figure.subplots(2, 2, sharex=True).ravel()
         for axis, (name, label) in zip(axes, PANELS.items(), strict=True):
             curves = {run: points for run, rows in histories.items() if len(points := _points(rows, name))}
-            _draw_runs(axis, curves, list(histories))
+            for run, points in curves.items():
+                marker, width = "o" if len(points) < 60 else None, 1.8 if len(histories) == 1 else 1.2
+                axis.plot(*points.T, color=tints[run], linewidth=width, marker=marker, markersize=4)
             if name != "reward":
-                for run in curves:
-                    for point in _points(_rows_of(histories, kept, run), name):
+                for run in filter(best.get, curves):
+                    for point in _points([best[run]], name):
                         axis.plot(*point, linestyle="none", **_STAR)
             if len(curves) > 1:
                 steps, median, lowest, highest = spread(list(curves.values()))
@@ -68,8 +74,7 @@ def save_curves(
             axis.set_xlabel("control steps flown")
             axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
         figure.suptitle(title + "\n")
-        best = [row for run in histories for row in _rows_of(histories, kept, run)]
-        handles = _handles(list(histories), interval, best)
+        handles = _handles(list(histories), interval, list(best.values()))
         if handles:
             figure.legend(handles=handles, loc="outside lower center", ncols=6)
         style.save(figure, path)
@@ -93,21 +98,6 @@ def _points(rows: Sequence[Mapping[str, float]], name: str) -> np.ndarray:
     """(p, 2) numbers of steps and values, without missing values."""
     points = [(row["steps"], row[name]) for row in rows if name in row and np.isfinite(row[name])]
     return np.array(sorted(points)).reshape(-1, 2)
-
-
-def _draw_runs(axis: Any, curves: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
-    tints = dict(zip(names, _tints(len(names)), strict=True))
-    for name, points in curves.items():
-        marker = "o" if len(points) < 60 else None
-        alone = len(names) == 1
-        axis.plot(*points.T, color=tints[name], linewidth=1.8 if alone else 1.2, marker=marker, markersize=4)
-
-
-def _rows_of(
-    histories: Mapping[str, Sequence[Mapping[str, float]]], kept: Mapping[str, int] | None, run: str
-) -> list[Mapping[str, float]]:
-    """Row of the best policy of a run."""
-    return [row for row in histories[run] if kept and "update" in row and row["update"] == kept.get(run)]
 
 
 def _tints(runs: int) -> tuple[str, ...]:

@@ -188,13 +188,12 @@ def gate(
     pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
     outer, offset = opening + 2 * frame, (opening + frame) / 2
     sin, cos = sin_cos(yaw)
-    half_sin, half_cos = sin_cos(yaw / 2)
     left = jnp.array([0.0, 0.0, offset, -offset], pos.dtype)
     up = jnp.array([offset, -offset, 0.0, 0.0], pos.dtype)
     lying, standing = (depth, outer, frame), (depth, frame, opening)
     return Box(
         pos=pos[None] + jnp.stack([-sin * left, cos * left, up], axis=-1),
-        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (BEAMS, 1)),
+        quat=jnp.tile(_level(yaw)[None], (BEAMS, 1)),
         size=jnp.array([lying, lying, standing, standing], pos.dtype),
         color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (BEAMS, 1)),
     )
@@ -269,7 +268,7 @@ def _random_places(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> 
     return jax.random.uniform(key, (count, 3), minval=corners[:1], maxval=corners[1:])
 
 
-def _level(yaw: Float[Array, " k"]) -> Float[Array, "k 4"]:
+def _level(yaw: Float[Array, "*k"]) -> Float[Array, "*k 4"]:
     """Quaternions of headings, rad."""
     sin, cos = sin_cos(yaw / 2)
     return jnp.stack([0 * sin, 0 * sin, sin, cos], axis=-1)

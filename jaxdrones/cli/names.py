@@ -18,9 +18,8 @@ def add(commands) -> None:
     parser.set_defaults(run=_list)
 
 
-def known_names() -> dict[str, list[str]]:
-    """Known names by kind."""
-    return {
+def _list(options: argparse.Namespace) -> int:
+    names = {
         "flights": list(FLIGHTS),
         "vehicles": list(assets.vehicles()),
         "effects": list(EFFECTS | PAIRS),
@@ -34,9 +33,5 @@ def known_names() -> dict[str, list[str]]:
         "algorithms": list(ALGORITHMS),
         "policies": [*assets.policies(), *POLICIES],
     }
-
-
-def _list(options: argparse.Namespace) -> int:
-    names = known_names()
     print_results(options, names, *(f"{kind:12} {', '.join(known)}" for kind, known in names.items()))
     return 0

@@ -14,7 +14,6 @@ from jaxdrones import arguments
 from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import add_live, live_server, show_training
-from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle, option, switch
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
@@ -24,6 +23,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import Diverged
 from jaxdrones.learning.loggers import named_loggers
 from jaxdrones.training import distributed, loop
+from jaxdrones.training.algorithms import ALGORITHMS
 from jaxdrones.training.distributed import fail_together
 from jaxdrones.training.lock import locked
 from jaxdrones.training.presets import settings_known

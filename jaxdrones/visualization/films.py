@@ -82,7 +82,7 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
         return drawn_film.frames(record, title, fps, size)
     from jaxdrones.visualization import replay  # needs pybullet
 
-    return replay.frames(record, title, fps, size)
+    return replay.frames(record, fps, size)
 
 
 def film_page(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit") -> int:

@@ -14,8 +14,8 @@ from jaxdrones.visualization.shots import FIELD_OF_VIEW, rows_of_frames, shoot
 FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
 
 
-def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    """Frames (height, width, 3) uint8 of a film by Bullet, without title."""
+def frames(record: FlightLog, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    """Frames (height, width, 3) uint8 of a film by Bullet."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW, near=0.02)
     with bullet.make_step(scene=record.scene) as step:

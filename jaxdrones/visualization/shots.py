@@ -14,6 +14,7 @@ from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing import Mesh, Scene, Urdf, from_urdf, ray
 
 FIELD_OF_VIEW = 45.0  # degrees, vertical
+_SLOPE = float(np.tan(np.deg2rad(FIELD_OF_VIEW) / 2))  # half of the height of a picture at 1 m, m
 _FAR = 1e6  # m; states beyond are not shown
 _FILLED = 0.85  # largest fraction of the picture, along each side, for the team
 _LARGE = 0.06  # smallest height of a drone over that of the picture for a static camera
@@ -65,7 +66,7 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
     everything = everything[:: max(1, len(everything) // _POINTS)]
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
     points = (everything - middle)[None]
-    if reach / (_distance(points, reach, directions[0], aspect)[0] * _slope()) >= _LARGE:
+    if reach / (_distance(points, reach, directions[0], aspect)[0] * _SLOPE) >= _LARGE:
         middle, points = (np.broadcast_to(x, (len(rows), *x.shape[-k:])) for x, k in ((middle, 1), (points, 2)))
     else:
         team = record.pos[rows].astype(float)
@@ -80,7 +81,7 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
     blocking = hidden[:, best].mean(axis=-1) > _BLOCKING
     kept = [solid for i, solid in scene.numbered.items() if not blocking[i]]
     scene = Scene.of(*kept, ground=scene.ground)
-    smallest = reach / (np.linalg.norm(eyes[best] - middle, axis=1).max() * _slope())
+    smallest = reach / (np.linalg.norm(eyes[best] - middle, axis=1).max() * _SLOPE)
     scale = next((scale for scale in _SCALES if scale * smallest > _SMALL), _SCALES[-1])
     return Shot(rows, eyes[best], middle, scene, scale)
 
@@ -115,10 +116,6 @@ def only_shapes(scene: Scene) -> Scene:
     return Scene.of(*solids, ground=scene.ground)
 
 
-def _slope() -> float:
-    return float(np.tan(np.deg2rad(FIELD_OF_VIEW) / 2))
-
-
 def _calm(low: np.ndarray, high: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed bounding boxes: means of boxes that contain all within `half` frames."""
     from scipy import ndimage  # loading it takes a tenth of a second
@@ -133,7 +130,7 @@ def _distance(points: np.ndarray, reach: float, direction: np.ndarray, aspect: f
     right = np.cross([0, 0, 1.0], direction)
     right /= np.linalg.norm(right)
     up = np.cross(direction, right)
-    tall = _FILLED * _slope()
+    tall = _FILLED * _SLOPE
     across = np.maximum((np.abs(points @ right) + reach) / (tall * aspect), (np.abs(points @ up) + reach) / tall)
     return (across + points @ direction).max(axis=1)
 

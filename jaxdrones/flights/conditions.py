@@ -59,9 +59,7 @@ class Conditions:
 
     def __post_init__(self):
         flight = FLIGHTS[self.flight]
-        default = dict(
-            drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration
-        )
+        default = {name: getattr(flight, name) for name in ("drones", "effects", "control_hz", "duration")}
         default["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
         if self.controller in ("firmware_pid", "mellinger"):
             default["control_hz"] = _FIRMWARE_HZ

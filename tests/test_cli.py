@@ -10,7 +10,7 @@ import pytest
 from helpers import mostly_slow
 
 from jaxdrones.cli import main
-from jaxdrones.cli.report import summary, table
+from jaxdrones.cli.report import listed, summary, table
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.fly import fly
 from jaxdrones.training import algorithms
@@ -36,6 +36,12 @@ def test_many_drones_are_three_rows():
     assert lowest == {"drone": "lowest", "rms_error_m": 0.0, "settled_after_s": 2.0}
     assert (median["rms_error_m"], highest["rms_error_m"], highest["drone"]) == (2.0, 4.0, "highest")
     assert "-" in table(summary([row | {"settled_after_s": None} for row in rows]))
+
+
+def test_counts_are_printed_with_all_digits():
+    assert listed({"published": 1_234_567, "landed": True, "simulated_s": 2.5}) == (
+        "published 1234567, landed 1, simulated s 2.5"
+    )
 
 
 @pytest.mark.parametrize(

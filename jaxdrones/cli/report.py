@@ -45,7 +45,8 @@ def print_results(options: argparse.Namespace, results: dict[str, Any], *lines: 
 
 def listed(results: dict[str, Any]) -> str:
     """Names and numbers in one line."""
-    return ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in results.items())
+    shown = {name: f"{x:d}" if isinstance(x, int) else f"{x:g}" for name, x in results.items()}
+    return ", ".join(f"{name.replace('_', ' ')} {x}" for name, x in shown.items())
 
 
 def _finite(x):

@@ -160,15 +160,15 @@ class ExplicitStep(Step):
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)
 
-        def commanded(params: Params, state: State, rpm: ArrayLike) -> jax.Array:
+        def within_limits(params: Params, state: State, rpm: ArrayLike) -> tuple[State, jax.Array]:
+            """State with limited rotor speeds, and commanded rotor speeds."""
             command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
             check_team(params, state, command)
-            return command
+            return state.replace(rpm=jax.vmap(limited)(params, state.rpm)), command
 
         @apart_under_vmap
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            command = commanded(params, state, rpm)
-            state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
+            state, command = within_limits(params, state, rpm)
             near = NearObstacles(physics.contacts("obstacles"), state, scene) if physics.touches(scene) else None
 
             @recomputed
@@ -185,7 +185,7 @@ class ExplicitStep(Step):
             return jax.lax.scan(lambda state, _: (substep(state, command), None), state, length=substeps)[0]
 
         def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            command = commanded(params, state, rpm)
+            state, command = within_limits(params, state, rpm)
             return derivative(params, physics.at_speed(params, state, command), command, scene)
 
         self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)

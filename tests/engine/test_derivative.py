@@ -30,6 +30,15 @@ def test_the_rate_of_a_step_is_its_derivative():
     assert_close(step.rate(TEAM, START, COMMAND), jd.make_derivative(**PHYSICS)(TEAM, START, COMMAND), 1e-9, rtol=1e-12)
 
 
+def test_a_rate_begins_like_a_step_at_limited_rotor_speeds():
+    """Of a state whose rotors turn too fast or backwards, as after a filter or an optimizer."""
+    step = make_step(rotors=jd.lagging_rotors)
+    beyond = START.replace(rpm=jnp.array([[1.5, -0.5, 1.0, 0.5]]) * TEAM.max_rpm[:, None])
+    within = START.replace(rpm=jnp.array([[1.0, 0.0, 1.0, 0.5]]) * TEAM.max_rpm[:, None])
+    assert_close(step(TEAM, beyond, COMMAND), step(TEAM, within, COMMAND), 0)
+    assert_close(step.rate(TEAM, beyond, COMMAND), step.rate(TEAM, within, COMMAND), 0)
+
+
 @pytest.mark.slow
 def test_its_jacobian_about_hover_is_that_of_the_linearized_quadrotor():
     """A tilt about x accelerates along -g y, one about y along g x; thrust lifts by 2 k_F rpm / m."""

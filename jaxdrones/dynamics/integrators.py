@@ -4,10 +4,12 @@ A derivative has the type of its state, so a step is `x + dt k` leaf by leaf. On
 it is normalized, or rotated by the exponential of a rotation vector.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
@@ -18,6 +20,7 @@ Derivative = Callable[[State], State]
 Integrator = Callable[[Derivative, State, float], State]
 
 _MIDPOINT_ITERATIONS = 8
+_MAX_TURN = math.pi / 2  # rad about an axis in a step; Bullet's limit of the angle
 
 
 def euler(derivative: Derivative, state: State, dt: float) -> State:
@@ -29,12 +32,14 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     """Semi-implicit Euler, order 1: velocities first, then poses with the new velocities.
 
     The attitude is rotated by the exponential map. The order of operations is that of gym-pybullet-drones. The explicit
-    gyroscopic term gains energy in a tumble (docs/physics.md), so use another integrator above a few rad/s.
+    gyroscopic term gains energy in a tumble (docs/physics.md), so use another integrator above a few rad/s. Body rates
+    are limited to a quarter turn per step, which keeps the fastest tumble finite.
     """
     state = _normalized(state)  # the exponential map keeps the length only up to rounding
     after = _add(state, dt, derivative(state))
-    pos, quat = state.pos + dt * after.vel, jax.vmap(_turn)(state.quat, dt * after.omega)
-    return after.replace(pos=pos, quat=quat, aux=_moved(state.aux, after.aux, dt))
+    omega = jnp.clip(after.omega, -_MAX_TURN / dt, _MAX_TURN / dt)
+    pos, quat = state.pos + dt * after.vel, jax.vmap(_turn)(state.quat, dt * omega)
+    return after.replace(pos=pos, quat=quat, omega=omega, aux=_moved(state.aux, after.aux, dt))
 
 
 def midpoint(derivative: Derivative, state: State, dt: float) -> State:

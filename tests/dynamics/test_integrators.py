@@ -107,6 +107,17 @@ def test_semi_implicit_euler_gains_the_documented_energy(vehicle, gain):
     assert momentum <= 0.07
 
 
+def test_the_fastest_tumble_stays_finite_and_slower_ones_are_not_limited():
+    """Without the limit, a drone of 22 g that turns at 590 rad/s is not finite after a second."""
+    light = params.replace(mass=jnp.array(0.022), gravity=jnp.zeros(()))
+    team = jaxdrones.repeat(light, 2)
+    omega = jnp.array([[340.0, 340.0, 340.0], [376.0, 0.0, 0.0]])
+    start = State.at_rest(jnp.zeros((2, 3))).replace(omega=omega)
+    end = make_step(substeps=240)(team, start, jnp.zeros((2, 4)))
+    assert np.all(np.abs(end.omega) <= 240 * np.pi / 2 * (1 + 1e-12)) and np.isfinite(end.quat).all()
+    np.testing.assert_array_equal(end.omega[1], omega[1])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=name_of)
 def test_without_forces_a_drone_flies_straight_on(integrator):

@@ -66,7 +66,7 @@ class PerAxis(PyTreeNode):
     tilt_given: Array
     """() whether roll and pitch follow `rpy` or `omega`, not x and y."""
     rates_given: Array
-    """() whether they follow `omega`, not `rpy`."""
+    """(2,) whether roll and whether pitch follows `omega`, not `rpy`."""
     thrust: Array
     """() thrust of each motor, 16 bit; at 0 the motors stop and the integrators are reset."""
     thrust_given: Array
@@ -219,9 +219,11 @@ def _fly_per_axis(
     )
     given = loops.degrees(setpoint.rpy)
     attitude = jnp.append(jnp.where(setpoint.tilt_given, given[:2], memory.tilt), given[2])
+    by_rates = jnp.append(setpoint.tilt_given & setpoint.rates_given, False)
+    attitude = jnp.where(by_rates, loops.rpy(state.quat), attitude)
     thrust = jnp.where(setpoint.thrust_given, jnp.clip(setpoint.thrust, 0, motors.FULL), memory.thrust)
     memory, target = loops.attitude_loop(gains, memory, state, attitude, dt)
-    by_rates = jnp.append(jnp.repeat(setpoint.tilt_given & setpoint.rates_given, 2), False)
+    memory = memory.replace(attitude_integral=jnp.where(by_rates, 0, memory.attitude_integral))
     target = jnp.where(by_rates, loops.degrees(setpoint.omega), target)
     return _with_torque(gains, memory, state, attitude, thrust, target, dt)
 

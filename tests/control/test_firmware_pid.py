@@ -165,7 +165,7 @@ def test_velocities_attitudes_and_rates_are_flown():
     np.testing.assert_allclose(after(firmware_pid.Rates(omega, jnp.array(36000.0)), 500).omega, omega, atol=0.05)
 
 
-def per_axis(by_pos=(True, True, True), tilt=False, rates=False, direct=False, **given):
+def per_axis(by_pos=(True, True, True), tilt=False, rates=(False, False), direct=False, **given):
     flags = dict(by_pos=by_pos, tilt_given=tilt, rates_given=rates, thrust_given=direct)
     zero = dict(pos=[0.0, 0, 0], vel=[0.0, 0, 0], rpy=[0.0, 0, 0], omega=[0.0, 0, 0], thrust=0.0)
     return firmware_pid.PerAxis(**{name: jnp.array(x) for name, x in (zero | flags | given).items()})
@@ -210,9 +210,24 @@ def test_a_mode_of_one_axis_leaves_the_others_alone():
     tilted = command(tilt=True, rpy=[0.2, -0.1, 0], pos=[5.0, 5, 1.2])  # as those of attitude and height are
     np.testing.assert_allclose(tilted.attitude, np.rad2deg([0.2, 0.1, 0]), atol=1e-6)
     np.testing.assert_allclose(tilted.thrust, up.thrust)
-    spun = command(tilt=True, rates=True, direct=True, omega=[1.0, 2, 9], thrust=4e4)
+    spun = command(tilt=True, rates=(True, True), direct=True, omega=[1.0, 2, 9], thrust=4e4)
     rates = firmware_pid.Rates(jnp.array([1.0, 2, 0]), jnp.array(4e4))
     np.testing.assert_allclose(spun.torque, firmware_pid.pwm(gains, firmware_pid.init(), LEVEL, rates)[1].torque)
+    angles = command(tilt=True, direct=True, rpy=[0.2, -0.1, 0], thrust=4e4)
+    for by_rate in ((True, False), (False, True)):
+        mixed = command(tilt=True, rates=by_rate, direct=True, omega=[1.0, 2, 9], rpy=[0.2, -0.1, 0], thrust=4e4)
+        np.testing.assert_allclose(mixed.torque[:2], np.where(by_rate, spun.torque[:2], angles.torque[:2]))
+
+
+def test_an_attitude_is_not_integrated_on_an_axis_that_follows_a_rate():
+    """Otherwise a drone that turned would be tilted, after its rates, by up to the limit of the integral."""
+    gains, memory = firmware_pid.gains(), firmware_pid.init()
+    rolled = LEVEL.replace(quat=rotation.from_rpy(jnp.array([0.5, 0.3, 0.0])))
+    target = per_axis(tilt=True, rates=(True, False), direct=True, thrust=4e4)
+    for _ in range(3):
+        memory, command = firmware_pid.pwm(gains, memory, rolled, target)
+    assert memory.attitude_integral[0] == 0 and memory.attitude_integral[1] != 0
+    np.testing.assert_allclose(command.attitude[0], np.rad2deg(0.5))
 
 
 def test_without_thrust_the_motors_stand_still():

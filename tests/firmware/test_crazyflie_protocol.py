@@ -184,7 +184,7 @@ def test_a_pitch_on_the_wire_is_positive_nose_up():
         assert found.setpoint.tilt_given
     rates = generic(11, 10.0, 20.0, 30.0, 30000, 1, form="fffHB").setpoint
     np.testing.assert_allclose(np.rad2deg(rates.omega[:2]), [10, -20])
-    assert rates.rates_given and rates.thrust == 30000
+    assert rates.rates_given.all() and rates.thrust == 30000
 
 
 def compress(quat):
@@ -222,6 +222,18 @@ def test_thrust_is_locked_until_it_was_zero_and_its_yaw_rate_is_clockwise():
     found = rpyt(commander, roll=10, pitch=20, yaw=90, thrust=65000)
     assert found.setpoint.thrust == 60000 and found.yaw_rate == pytest.approx(-math.pi / 2)
     np.testing.assert_allclose(np.rad2deg(found.setpoint.rpy[:2]), [10, -20])
+
+
+@pytest.mark.parametrize("by_rate", [(False, False), (True, False), (False, True), (True, True)])
+def test_roll_and_pitch_are_angles_or_rates_by_a_mode_each(by_rate):
+    commander = make_commander()
+    for axis, is_rate in zip(("Roll", "Pitch"), by_rate, strict=True):
+        commander._parameters.values[f"flightmode.stabMode{axis}"] = float(not is_rate)
+    rpyt(commander)
+    found = rpyt(commander, roll=10, pitch=20, thrust=30000).setpoint
+    followed = np.where(found.rates_given, found.omega[:2], found.rpy[:2])
+    np.testing.assert_allclose(np.rad2deg(followed), [10, -20])
+    assert found.tilt_given and found.rates_given.tolist() == list(by_rate)
 
 
 def test_without_set_points_the_vehicle_levels_and_then_stops():

@@ -57,12 +57,10 @@ class Commander:
             self._thrust_locked = False
         thrust = 0 if self._thrust_locked or thrust < _LEAST_THRUST else min(thrust, _MOST_THRUST)
         by_rate = not self._parameters["flightmode.stabModeRoll"], not self._parameters["flightmode.stabModePitch"]
-        angles = np.deg2rad([roll, -pitch, 0.0])
         heading: dict[str, Any] = {"yaw_rate": -math.radians(yaw)}  # of this packet alone it is clockwise
         if self._parameters["flightmode.stabModeYaw"]:
             heading = {"yaw": math.radians(yaw)}
-        which: dict[str, Any] = {"rates": angles} if all(by_rate) else {"rpy": angles}
-        self._stream(target(thrust=thrust, **which, **heading), t)
+        self._stream(target(thrust=thrust, rpy=np.deg2rad([roll, -pitch, 0.0]), by_rate=by_rate, **heading), t)
 
     def generic(self, channel: int, data: bytes, t: float) -> None:
         """Set a set-point of any kind, or end a stream."""
@@ -108,7 +106,7 @@ class Commander:
 
 def _level(old: Target) -> Target:
     """Level attitude at the height or thrust of a set-point."""
-    setpoint = old.setpoint.replace(rpy=np.zeros(3), tilt_given=np.array(True), rates_given=np.array(False))
+    setpoint = old.setpoint.replace(rpy=np.zeros(3), tilt_given=np.array(True), rates_given=np.zeros(2, bool))
     return old.replace(setpoint=setpoint, yaw_rate=np.array(0.0), yaw_given=np.array(False))
 
 
@@ -138,8 +136,7 @@ def _decode(kind: int, values: tuple[Any, ...]) -> Target:
         return target(pos, yaw=math.radians(degrees))
     roll, pitch, yaw_rate, thrust, by_rate = values
     angles = np.deg2rad([roll, -pitch, 0])
-    which: dict[str, Any] = {"rates": angles} if by_rate else {"rpy": angles}
-    return target(thrust=thrust, yaw_rate=math.radians(yaw_rate), **which)
+    return target(thrust=thrust, yaw_rate=math.radians(yaw_rate), rpy=angles, by_rate=(by_rate, by_rate))
 
 
 def decompress(number: int) -> np.ndarray:

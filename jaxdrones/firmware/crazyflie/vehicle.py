@@ -102,7 +102,7 @@ def target(
     height: float | None = None,
     in_heading: bool = False,
     rpy: Any = None,
-    rates: Any = None,
+    by_rate: tuple[bool, bool] = (False, False),
     thrust: float | None = None,
     yaw: float | None = None,
     yaw_rate: float = 0.0,
@@ -110,8 +110,8 @@ def target(
     """Set-point from what a command gives, in SI units, world axes; every axis has one source.
 
     By default the drone follows `vel`, which is along the heading if `in_heading`. `pos` replaces it, and `height` its
-    z; roll and pitch of `rpy`, or roll and pitch `rates`, right-handed, replace x and y; the `thrust` of each motor, 16
-    bit, replaces z. `yaw_rate` is used without `yaw`.
+    z; roll and pitch of `rpy`, right-handed, angles or rates where `by_rate`, replace x and y; the `thrust` of each
+    motor, 16 bit, replaces z. `yaw_rate` is used without `yaw`.
     """
     by_pos = [pos is not None, pos is not None, pos is not None or height is not None]
     place = np.zeros(3) if pos is None else np.asarray(pos, float)
@@ -121,9 +121,9 @@ def target(
         vel=np.asarray(vel, float),
         by_pos=np.array(by_pos),
         rpy=np.append(angles[:2], 0.0 if yaw is None else yaw),
-        omega=np.zeros(3) if rates is None else np.asarray(rates, float),
-        tilt_given=np.array(rpy is not None or rates is not None),
-        rates_given=np.array(rates is not None),
+        omega=angles,
+        tilt_given=np.array(rpy is not None),
+        rates_given=np.array(by_rate, bool),
         thrust=np.array(0.0 if thrust is None else thrust),
         thrust_given=np.array(thrust is not None),
     )

@@ -205,7 +205,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env.close()
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-        if seed is None or isinstance(seed, int | np.integer):
+        if not isinstance(seed, Sequence | np.ndarray):
+            if seed is not None:
+                check_whole("seed", seed, 0)
             super().reset(seed=None if seed is None else int(seed))
             first = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)
             seeds = [first + i for i in range(self.num_envs)]

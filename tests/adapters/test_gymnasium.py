@@ -129,6 +129,9 @@ def test_mistakes_are_named(env_of):
     for wrong in -1, 1.5:
         with pytest.raises(ValueError, match=f"an entry of seed is {wrong}; give a whole number of at least 0"):
             envs.reset(seed=[0, wrong, None])
+    for wrong in -1, 1.5, True:
+        with pytest.raises(ValueError, match=f"^seed is {wrong!r}; give a whole number of at least 0$"):
+            envs.reset(seed=wrong)
     with pytest.raises(ValueError, match="unknown autoreset_mode 'Never'"):
         VectorEnv(short(env_of), 3, autoreset_mode="Never")
     with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'; did you mean 'height'"):

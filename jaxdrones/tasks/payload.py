@@ -52,7 +52,7 @@ def sling(
 
     Args:
         drones: number of drones, each with a load and a curve of its own; the centers of the curves are 4 m apart in y.
-        load: mass of a load over that of a drone.
+        load: mass of a load over that of the nominal drone; the random mass of an episode does not change it.
         length: length of the cable, m.
         curve: a name of `jaxdrones.tasks.curves.SHAPES`.
         period: period of the curve, s.
@@ -77,7 +77,7 @@ def transport(
 
     Args:
         drones: number of drones, 2 to 8.
-        load: mass of the load over that of all drones.
+        load: mass of the load over that of all nominal drones; random masses of an episode do not change it.
         length: length of the cables, m.
         curve: a name of `jaxdrones.tasks.curves.SHAPES`.
         period: period of the curve, s.
@@ -93,7 +93,7 @@ class _Carrying:
 
     drones: int
     load: float
-    """Mass of the load over that of its drones."""
+    """Mass of the load over that of its nominal drones."""
     length: float
     """m, of the cables."""
     curve: str

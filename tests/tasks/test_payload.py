@@ -8,6 +8,7 @@ from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.envs import make
+from jaxdrones.envs.randomize import draw
 from jaxdrones.learning import bptt, evaluate
 from jaxdrones.training.presets import preset
 
@@ -51,6 +52,15 @@ def test_the_mass_of_a_load_is_the_share_of_its_drones(task, drones, mass):
     np.testing.assert_allclose(load.mass, mass * env.params.mass[0], rtol=1e-6)
     np.testing.assert_allclose(load.length, 0.7, rtol=1e-6)
     np.testing.assert_allclose(load.stiffness * load.onset, 0.5 * env.params.mass * 9.8, rtol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["sling", "transport"])
+def test_a_load_is_the_same_whatever_the_random_mass_of_its_drones(task):
+    env = make(task, load=0.5, realistic=True)
+    params = jit_unoptimized(jax.vmap(lambda key: draw(env.draws, key, env.params)))(KEYS)
+    assert np.ptp(np.asarray(params.mass)) > 0.1 * float(env.params.mass[0])
+    load = np.asarray(params.aux["payload"].mass)
+    np.testing.assert_allclose(load, np.broadcast_to(env.params.aux["payload"].mass, load.shape))
 
 
 @pytest.mark.slow

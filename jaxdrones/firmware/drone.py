@@ -89,7 +89,7 @@ class Recorder:
         return len(self._rows)
 
     def add(self, t: float, now: Sample, target: Any = None) -> None:
-        """Add a row: time (s), sample of the drone and target position (3,) (m, world), if it has one."""
+        """Add a row: time (s), sample of the drone and target position (3,) (m, world), if it has one then."""
         unknown = np.full(3, np.nan)
         arrays = (now.pos, now.quat, now.vel, now.omega, now.rpm, unknown if target is None else target)
         self._rows.append((t, *(np.array(x, np.float32) for x in arrays)))
@@ -98,7 +98,6 @@ class Recorder:
         """Log of the flight; the conditions, with `vehicle`, are for JSON, and `about` is the title."""
         t, *arrays = map(np.array, zip(*self._rows, strict=True))
         pos, quat, vel, omega, rpm, target = (x[:, None] for x in arrays)
-        known = np.isfinite(target).all()  # a log has targets in all rows or in none
         return FlightLog(
             t=t.astype(float),
             pos=pos,
@@ -106,7 +105,7 @@ class Recorder:
             vel=vel,
             omega=omega,
             rpm=rpm,
-            target_pos=target if known else np.asarray(np.nan),
+            target_pos=target,
             conditions=LoggedConditions(conditions, about),
             params=repeat(params, 1),
         )

@@ -165,7 +165,7 @@ class FlightLog:
 
     def difference(self) -> tuple[np.ndarray, str]:
         """(K, n, 3) difference between actual and commanded position or velocity, and its unit."""
-        if np.isnan(self.target_pos).any():
+        if not self.has("target_pos"):
             return self.vel - self.target_vel, "m/s"
         return self.pos - self.target_pos, "m"
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.cli import main
+from jaxdrones.firmware.drone import Recorder, Sample
 from jaxdrones.flights import load_flights, read_log, save_csv
 from jaxdrones.flights.log import OPTIONAL, STATE
 from jaxdrones.urdf import load_params
@@ -162,3 +163,13 @@ def test_what_fly_wrote_is_fitted(tmp_path, capsys):
     assert set(report["errors"]) == {"log.npz, drone 0", "log.npz, drone 1"}
     estimate = report["parameters"]["kf"]
     assert estimate["identifiable"] and estimate["value"] == pytest.approx(float(load_params("cf2x").kf), rel=0.01)
+
+
+def test_a_recorded_flight_keeps_its_targets_where_some_rows_have_none():
+    recorder, zero, place = Recorder(), np.zeros(3), np.array([0.0, 1, 2])
+    for target in (None, place, None):
+        recorder.add(0.01 * len(recorder), Sample(zero, np.eye(4)[3], zero, zero, np.ones(4), zero), target)
+    log = recorder.log(load_params("racer"), {}, "a flight")
+    difference, unit = log.difference()
+    np.testing.assert_allclose(difference[:, 0], [np.full(3, np.nan), -place, np.full(3, np.nan)])
+    assert unit == "m" and log.has("target_pos")

@@ -42,7 +42,7 @@ def _score(options: argparse.Namespace) -> int:
     vehicles = {"nominal": load_vehicle(options.nominal), "vehicle": load_vehicle(options.vehicle)}
     logs = load_logs(options.logs, options.allow_inconsistent)
     gains = firmware_pid.gains(propellers=options.propellers)
-    with_setpoints = [log for log in logs if log.has("target_pos", "pwm")]
+    with_setpoints = [log for log in logs if log.has("target_pos", "target_yaw", "pwm")]
     if options.figure:
         _check_figure(options.figure, bool(with_setpoints))
     flights = len(logs) + len(vehicles) * (len(logs) + len(with_setpoints))

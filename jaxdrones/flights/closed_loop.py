@@ -86,7 +86,7 @@ class ClosedLoopInputs(NamedTuple):
 
 def closed_loop_columns(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Set-points of position (K, 3) and heading (K,), PWM (K, 4) and battery voltage (K,) of a log."""
-    if not log.has("target_pos", "pwm", "vbat"):
+    if not log.has("target_pos", "target_yaw", "pwm", "vbat"):
         raise UserError(f"{log.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
     return log.target_pos[:, 0], log.target_yaw[:, 0], log.pwm[:, 0], log.vbat[:, 0]
 

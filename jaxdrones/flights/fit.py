@@ -107,7 +107,7 @@ def fit(
     if len(kinds) > 1:
         raise UserError("some logs have rotor speeds and others only PWM; fit them one after the other")
     motors = motors or crazyflie_motors()
-    if not named and all(log.has("target_pos", "pwm") for log in logs):
+    if not named and all(log.has("target_pos", "target_yaw", "pwm") for log in logs):
         return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
     default = parameters.FROM_ROTOR_SPEEDS if kinds.pop() else parameters.FROM_PWM
     names = parameters.select_parameters(names) if named else default

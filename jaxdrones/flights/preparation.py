@@ -131,8 +131,6 @@ def _checked(log: FlightLog) -> FlightLog:
         if x.ndim:
             _check_units(log.name, name, x)
     _check_times(log.name, arrays["t"])
-    if log.has("target_pos") and not log.has("target_yaw"):
-        arrays["target_yaw"] = np.zeros((len(log.t), 1))
     arrays["quat"] /= np.linalg.norm(arrays["quat"], axis=-1, keepdims=True)
     return dataclasses.replace(log, **arrays)
 

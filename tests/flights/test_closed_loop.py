@@ -1,5 +1,7 @@
 """Closed-loop simulations of flights on set-points start at take-off or in flight."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ import jaxdrones
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import FlightLog, Vehicle, simulate_closed_loop
+from jaxdrones.flights.closed_loop import closed_loop_columns
+from jaxdrones.flights.preparation import prepare
 
 ROWS, REST, LOADED = 700, 4.1, 3.3
 HEIGHT = 0.5  # m, of the set-point
@@ -30,6 +34,14 @@ def log_of(height, begin):
         target_pos=np.where(runs[:, None], HEIGHT * up, 0)[:, None],
         target_yaw=np.zeros((ROWS, 1)),
     )
+
+
+def test_a_heading_that_was_not_recorded_is_not_taken_for_north():
+    unknown = dataclasses.replace(log_of(0.05, TAKE_OFF), target_yaw=np.asarray(np.nan))
+    (log,) = prepare(unknown, allow_inconsistent=True)
+    assert log.has("target_pos") and not log.has("target_yaw")
+    with pytest.raises(ValueError, match="has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop"):
+        closed_loop_columns(log)
 
 
 @pytest.fixture(scope="module")

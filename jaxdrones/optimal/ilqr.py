@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked
+from jaxdrones.arguments import Count, checked
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, hover, posed
+from jaxdrones.optimal.problem import Horizon, Reference, Weights, hover, posed
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -66,11 +66,12 @@ class Solution(PyTreeNode):
     """(iterations,) cost after each iteration, never increasing."""
 
 
-def settings(step: Any, weights: Weights | None = None, horizon: int = 25, iterations: int = 2) -> Settings:
+@checked
+def settings(step: Any, weights: Weights | None = None, horizon: Horizon = 25, iterations: Count = 2) -> Settings:
     """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
-    The terminal cost after `horizon` control steps is that of the regulator of `lqr`. The `iterations` of a call of
-    `control` start from the previous plan.
+    The terminal cost after `horizon` control steps, at least two, is that of the regulator of `lqr`. The `iterations`
+    of a call of `control` start from the previous plan.
     """
     return Settings(default_weights() if weights is None else weights, step, horizon, iterations=iterations)
 

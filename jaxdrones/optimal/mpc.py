@@ -6,14 +6,14 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 
-from jaxdrones.arguments import checked, choice
+from jaxdrones.arguments import Seconds, checked, choice, number
 from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneState
 from jaxdrones.optimal.coordinates import tracking_error
 from jaxdrones.optimal.interpreter import on_symbols
 from jaxdrones.optimal.primitives import casadi
-from jaxdrones.optimal.problem import Weights, check_plan, reference
+from jaxdrones.optimal.problem import Horizon, Weights, check_plan, reference
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
@@ -40,10 +40,10 @@ class Mpc:
     def __init__(
         self,
         model: CasadiModel,
-        dt: float,
-        horizon: int = 20,
+        dt: Seconds,
+        horizon: Horizon = 20,
         weights: Weights | None = None,
-        terminal: float = 10.0,
+        terminal: Annotated[float, number(at_least=0)] = 10.0,
         solver: Annotated[str, choice("solver", SOLVERS)] = "ipopt",
     ):
         """Build the nonlinear program and its solver.
@@ -52,7 +52,7 @@ class Mpc:
             model: of one drone.
             dt: control period, s: the length of an interval of the plan, with a constant command and one step of the
                 classical Runge-Kutta method.
-            horizon: intervals of the plan.
+            horizon: intervals of the plan, at least two.
             weights: of the errors; by default `jaxdrones.optimal.weights()`.
             terminal: factor of the terminal weights of the state.
             solver: a name of `SOLVERS`.

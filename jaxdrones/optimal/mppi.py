@@ -6,20 +6,20 @@ stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Will
 relative to the spread of the costs, and the cost of the noise itself is left out.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked
+from jaxdrones.arguments import Count, checked, number
 from jaxdrones.control import Setpoint
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, hover, posed
+from jaxdrones.optimal.problem import Horizon, Reference, Weights, hover, posed
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -55,19 +55,20 @@ class Memory(PyTreeNode):
     """() `Status` of the last call, an integer."""
 
 
+@checked
 def settings(
     step: Any,
     weights: Weights | None = None,
-    horizon: int = 24,
-    samples: int = 256,
-    temperature: float = 0.3,
-    hold: int = 3,
+    horizon: Horizon = 24,
+    samples: Count = 256,
+    temperature: Annotated[float, number("standard deviations", at_least=0)] = 0.3,
+    hold: Count = 3,
 ) -> Settings:
     """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
-    The terminal cost after `horizon` control steps is that of the regulator of `lqr`. The temperature is in standard
-    deviations of the costs of the samples; a lower value favors the best sample. `hold` control steps lie between
-    samples of the noise: noise at every step hardly moves a drone.
+    The terminal cost after `horizon` control steps, at least two, is that of the regulator of `lqr`. The temperature is
+    in standard deviations of the costs of the samples; a lower value favors the best sample. `hold` control steps lie
+    between samples of the noise: noise at every step hardly moves a drone.
     """
     return Settings(
         default_weights() if weights is None else weights,

@@ -1,13 +1,14 @@
 """Cost functions and reference motions of optimal controllers."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
+from jaxdrones.arguments import whole
 from jaxdrones.checks import check_shape, is_concrete
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
@@ -18,6 +19,9 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.status import is_finite
 from jaxdrones.vector import along_z, cross, dot, safe_sqrt
+
+Horizon = Annotated[int, whole(minimum=2)]
+"""Control steps of a plan; two have an angular acceleration of the reference."""
 
 
 class Weights(PyTreeNode):

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
-from jaxdrones.arguments import checked, whole
+from jaxdrones.arguments import Count, checked, whole
 from jaxdrones.checks import look_up, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
 from jaxdrones.dynamics.aero import drag
@@ -66,7 +66,7 @@ def tune(
     controller: str | ModuleType,
     *,
     control_hz: Annotated[int, whole(minimum=100)] = 500,
-    iterations: int = 40,
+    iterations: Count = 40,
 ) -> Any:
     """Tune the gains of a controller for a vehicle, in steps, a turn, a tilted start and three curves.
 

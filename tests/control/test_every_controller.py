@@ -158,6 +158,15 @@ def test_gradients_of_a_call_agree_with_differences(loop):
         np.testing.assert_allclose(derivative, difference, rtol=2e-6)
 
 
+@pytest.mark.parametrize("loop", [loop for loop in EVERY_CONTROLLER if loop not in RATES], ids=repr)
+def test_a_time_between_calls_that_is_not_positive_is_refused(loop):
+    """Of all but that of body rates, which does not use it."""
+    team, memory, state, target = in_flight(loop)
+    arguments = (one(x, 0) for x in (team, memory, state, target))
+    with pytest.raises(ValueError, match=r"^dt is 0; give a positive number \(s\)$"):
+        loop.control(loop.gains(), *arguments, dt=0)
+
+
 @each_controller
 def test_without_weight_and_error_there_is_nothing_to_do(loop):
     """No rotor turns, but for the idle speed of the PID's motors and what the firmware takes for the weight."""

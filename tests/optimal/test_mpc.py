@@ -86,6 +86,9 @@ def test_what_does_not_fit_is_refused():
     team = jd.repeat(jd.load_params("cf2x"), 2)
     with pytest.raises(ValueError, match=r"unknown solver 'acados' \(known: fatrop, ipopt\)"):
         controller(solver="acados")
+    for option, value in ("dt", 0.0), ("horizon", 1), ("terminal", -1.0):
+        with pytest.raises(ValueError, match=f"^{option} is {value}; give a"):
+            Mpc(model(), **({"dt": DT} | {option: value}))
     with pytest.raises(ValueError, match="make one for each"):
         Mpc(casadi_model(team), DT)
     mpc, one_drone = controller(horizon=4), team_of("cf2x")

@@ -109,6 +109,20 @@ def test_near_hover_the_plan_is_that_of_the_regulator():
     np.testing.assert_allclose(plan.rpm[0] - params.hover_rpm, change, rtol=0, atol=1e-2 * np.max(np.abs(change)))
 
 
+@pytest.mark.parametrize(
+    ("module", "option", "least"),
+    [
+        *((module, "horizon", 2) for module in (ilqr, mppi)),
+        *((ilqr, "iterations", 1), (mppi, "samples", 1), (mppi, "hold", 1), (mppi, "temperature", 0)),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(module, option, least):
+    for value in (least - 1, np.nan, np.inf, True, "a", None):
+        with pytest.raises(ValueError, match=rf"^{option} is .*; give a .*number of at least {least}"):
+            module.settings(_step(), **{option: value})
+    assert getattr(module.settings(_step(), **{option: least}), option) == least
+
+
 def test_setpoints_that_do_not_fit_the_horizon_are_refused():
     team = team_of("cf2x")
     params, state, short = one(team), one(hovering(team)), Setpoint.at(jnp.zeros((3, 3)))

@@ -22,7 +22,7 @@ from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
 
 _GRID, _SPREAD = 0.4, 0.05  # m between starts along y, and half width of random displacements
-_LAP_SECONDS = 8.0  # s of an episode per lap
+_LAP_SECONDS, _MAX_LAPS = 8.0, 100  # s of an episode per lap; more laps compile for minutes
 _LEAD = 0.2  # m along the track; a drone with a smaller lead is beside the other one
 _FINISH = 1.5  # m, between the last gate and the points behind it
 _WIDE = 1.0  # m, edge of the opening that counts without contact
@@ -46,7 +46,7 @@ _LINE_ENTRIES = (
 def race(
     drones: Annotated[Drones, number(name="number of drones of {function}", at_most=4)] = 2,
     level: NonNegativeInt = 3,
-    laps: Annotated[int, whole("laps", 1)] = 1,
+    laps: Annotated[int, whole("laps", 1, _MAX_LAPS)] = 1,
     random_start: Switch = False,
     contact: Switch = True,
     acceleration: Annotated[float, number("m/s^2", above=0)] = 12.0,
@@ -60,7 +60,7 @@ def race(
         drones: number of drones, at most 4; they start 0.4 m apart in y, in random order.
         level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles. The policy
             does not observe the poles.
-        laps: number of laps of four gates.
+        laps: number of laps of four gates, at most 100.
         random_start: for training: start in flight at a random place of the track with probability 0.8, one behind
             the other, else on the ground at the start.
         contact: whether there are contact forces of ground and drones, gates and poles end a race, and only flights

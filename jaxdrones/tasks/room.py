@@ -26,13 +26,14 @@ _BESIDE = 1.0  # m between the places and the walls
 _SPACING = 1.0  # m between neighboring places on the ring
 _CLEARANCE = 0.6  # m between a pillar and a place
 _ARRIVED = 0.2  # m
+_MAX_SIZE = 1000.0  # m
 
 
 @checked
 def room(
     drones: Drones = 4,
     pillars: Annotated[int, whole("number of pillars of {function}", 0)] = 4,
-    size: Annotated[float, number("m", at_least=2 * _BESIDE + _SPACING)] = 6.0,
+    size: Annotated[float, number("m", at_least=2 * _BESIDE + _SPACING, at_most=_MAX_SIZE)] = 6.0,
     duration: float = 8.0,
 ) -> Task:
     """Drones on a ring in a room exchange places without collisions with each other, walls or pillars.
@@ -40,7 +41,7 @@ def room(
     Args:
         drones: number of drones; they start 1 m or more apart.
         pillars: number of random pillars; those too close to a start or a goal are left out.
-        size: length and width of the room, m.
+        size: length and width of the room, m; at most 1,000.
         duration: duration of an episode, s.
 
     Raises:

@@ -22,13 +22,15 @@ from jaxdrones.tasks.task import Task, Team, World
 HEIGHT = 1.0  # m, of the lowest drone
 _CAUGHT_UP = 1.0  # s: start of the altitude's evaluation
 _TOLERANCE = 0.05  # m
+_MAX_LENGTH = 1000.0  # m
+_LENGTH = number("m", above=0, at_most=_MAX_LENGTH)
 
 
 @checked
 def wake(
     drones: Team = 2,
-    spacing: Annotated[float, number("m", above=0)] = 0.5,
-    amplitude: Annotated[float, number("m", above=0)] = 0.5,
+    spacing: Annotated[float, _LENGTH] = 0.5,
+    amplitude: Annotated[float, _LENGTH] = 0.5,
     period: Annotated[float, number("s", at_least=1)] = 5.0,
     duration: Annotated[Seconds, number("s", above=_CAUGHT_UP)] = 10.0,
 ) -> Task:
@@ -38,8 +40,8 @@ def wake(
 
     Args:
         drones: number of drones, at least two.
-        spacing: difference of altitude of consecutive drones, m.
-        amplitude: of the swing, m.
+        spacing: difference of altitude of consecutive drones, m; at most 1,000.
+        amplitude: of the swing, m; at most 1,000.
         period: of the swing, s.
         duration: duration of an episode, s.
     """

@@ -59,6 +59,16 @@ def test_starts_from_which_a_drone_is_lost_at_once_are_refused():
         make("tracking", period=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("task", "option", "most"),
+    [("room", "size", 1e3), ("wake", "spacing", 1e3), ("wake", "amplitude", 1e3), ("race", "laps", 100)],
+)
+def test_sizes_at_which_rewards_are_not_finite_or_compiling_does_not_end_are_refused(task, option, most):
+    assert TASKS[task](**{option: most})
+    with pytest.raises(ValueError, match=rf"^{option} is {10 * most}; give .*at most {most:g}"):
+        TASKS[task](**{option: 10 * most})
+
+
 @pytest.mark.parametrize("option", ["control_hz", "substeps", "delay", "realistic"])
 def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
     optional = ("control_hz", "substeps", "delay")

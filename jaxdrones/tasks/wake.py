@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -97,15 +96,18 @@ def _altitude_error(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
-    counts = world.time > _CAUGHT_UP
-    square = jnp.where(counts, _altitude_error(task, world) ** 2, 0)
+    square = jnp.where(_steps_that_count(world) > 0, _altitude_error(task, world) ** 2, 0)
     return world.variables | {"squares": world.variables["squares"] + square}
 
 
 def _altitude_deviation(task: Task, world: World) -> Float[Array, " n"]:
     """Root mean square of the altitude's error after the first second, m."""
-    steps = jnp.maximum(world.step - math.floor(_CAUGHT_UP / world.dt), 1)
-    return jnp.sqrt(world.variables["squares"] / steps)
+    return jnp.sqrt(world.variables["squares"] / jnp.maximum(_steps_that_count(world), 1))
+
+
+def _steps_that_count(world: World) -> Array:
+    """Number of control steps after the first second, negative before; as in `shaping.caught_up`."""
+    return world.step - round(_CAUGHT_UP / world.dt)
 
 
 def _kept_altitude(metrics: Mapping[str, Array], dt: float) -> Array:

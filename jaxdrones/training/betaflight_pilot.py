@@ -33,8 +33,8 @@ class PolicyPilot:
                 f"the policy has the action type {env.action.name!r}, which sticks cannot command; train one with "
                 f"--set action={ACTION}"
             )
-        if env.vision is not None or env.sensors or env.drones != 1:
-            raise UserError(f"the policy is for {env}; give one of a single drone without cameras and sensors")
+        if env.vision is not None or env.sensors or env.physics.physics.models or env.drones != 1:
+            raise UserError(f"the policy is for {env}; give one of a single drone without cameras, sensors and loads")
         if env.dt < PERIOD - 1e-9:
             raise UserError(
                 f"the policy acts at {1 / env.dt:g} Hz, and sticks move at {1 / PERIOD:g} Hz; train one with "
@@ -70,7 +70,9 @@ class PolicyPilot:
 
 
 def _decide(env: Env, policy: AnyPolicy, hidden: Any, world: World) -> tuple[Any, World, jax.Array, jax.Array]:
-    """Hidden state, world with the new action, the action (4,), and the target position (3,)."""
+    """Hidden state, world with new variables and action, the action (4,), and the target position (3,)."""
+    variables = env.task.advance(env.task, world), world.variables
+    world = world.replace(variables=jax.tree.map(lambda x, start: jnp.where(world.step > 0, x, start), *variables))
     hidden, action = act(policy, hidden, observe(env.terms, env.task, world))
     action = jnp.clip(action, -1, 1)
     actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)

@@ -1,7 +1,9 @@
 """Packets and MSP: bytes as Betaflight's C structures have them, and signs as its axes have them."""
 
+import dataclasses
 import struct
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +12,8 @@ from jaxdrones.envs import make
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import Simulation, Sticks, msp, settings, sticks_for
 from jaxdrones.firmware.betaflight.packets import motor_order, motor_outputs, rc_packet, state_packet
+from jaxdrones.firmware.drone import Sample
+from jaxdrones.tasks.hover import hover
 from jaxdrones.training.betaflight_pilot import PolicyPilot
 
 LEVEL = np.array([0.0, 0, 0, 1])
@@ -174,3 +178,24 @@ def test_a_policy_faster_than_the_sticks_is_refused():
     env = make("hover", vehicle="racer", action="thrust_and_rates", control_hz=200)
     with pytest.raises(UserError, match="the policy acts at 200 Hz, and sticks move at 100 Hz"):
         PolicyPilot(env, lambda obs: obs)
+
+
+@pytest.mark.slow
+def test_a_policy_with_a_load_is_refused_which_the_simulated_drone_would_not_carry():
+    with pytest.raises(UserError, match="single drone without cameras, sensors and loads"):
+        PolicyPilot(make("sling", vehicle="racer"), lambda obs: obs)
+
+
+def test_the_variables_of_a_task_follow_the_flight_of_a_policy():
+    """As the next gate does: without it, a drone would turn back to the first one."""
+
+    def passed(task, world):
+        return {"goal": world.variables["goal"] + world.drones.pos}
+
+    env = make(dataclasses.replace(hover(), advance=passed), vehicle="racer", action="thrust_and_rates")
+    pilot, zero, up = PolicyPilot(env, lambda obs: jnp.zeros((1, 4))), np.zeros(3), np.array([0, 0, 1.0])
+    heights = [pilot.target[2]]
+    for k in range(3):
+        pilot(k * env.dt, Sample(up, np.eye(4)[3], zero, zero, np.ones(4), zero))
+        heights.append(pilot.target[2])
+    np.testing.assert_allclose(np.diff(heights), [0, 1, 1])

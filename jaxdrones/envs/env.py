@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.arguments import Key, checked
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_shape, check_whole, is_concrete
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
@@ -92,6 +92,8 @@ class Env:
         if self.draws_delay:
             params = randomize.with_delay(params, sum(self.delay_steps) / 2)
         object.__setattr__(self, "params", params)
+        if is_concrete(self.steps):
+            check_whole("steps", self.steps, 0)
         if isinstance(self.steps, int) and not self.steps:
             object.__setattr__(self, "steps", round(float(self.task.duration) / self.dt) + self.task.extra_steps)
 
@@ -146,7 +148,8 @@ class Env:
     def term_sizes(self) -> list[int]:
         """Length of every observation term of a drone."""
         first_world = functools.partial(episode.first_world, self)
-        return check_episode(self.task, self.params, self.draws, self.scene, self.terms, self.dt, first_world)
+        drawn, on_the_way = (self.draws, self.scene), (self.noise, self.disturbance)
+        return check_episode(self.task, self.params, *drawn, self.terms, self.dt, first_world, *on_the_way)
 
     @functools.cached_property
     def observation_bound(self) -> np.ndarray:

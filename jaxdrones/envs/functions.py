@@ -64,6 +64,8 @@ def check_episode(
     terms: Sequence[ObservationTerm],
     dt: float,
     first_world: Callable[[jax.Array], World],
+    noise: Callable | None = None,
+    disturbance: Callable | None = None,
 ) -> list[int]:
     """Validate the results of users' functions by tracing them; those of starts and randomizations for some keys.
 
@@ -77,9 +79,14 @@ def check_episode(
 
     def sizes(key: jax.Array) -> list[Any]:
         for k, function in enumerate(draws, 1):
-            _check_randomization(function, jax.random.fold_in(key, k), one)
+            _check_replaced("a randomization", function, jax.random.fold_in(key, k), one)
         _check_start(task, params, scene, jax.random.fold_in(key, 0))
         world = first_world(key)
+        noise_key, disturbance_key = (jax.random.fold_in(key, len(draws) + i) for i in (1, 2))
+        if noise is not None:
+            _check_replaced("noise", noise, noise_key, world.drones)
+        if disturbance is not None:
+            _check_replaced("disturbance", disturbance, disturbance_key, world.params, dt)
         _check_functions(task, world, dt)
         _check_terms(task, terms, world)
         return [term.observe(task, world) for term in terms]
@@ -138,14 +145,14 @@ def equipped(task: Task, params: Params) -> Params:
     return returned
 
 
-def _check_randomization(function: Callable, key: jax.Array, one: Params) -> None:
-    """Raise unless a randomization returns the parameters of one drone."""
-    returned = function(key, one)
+def _check_replaced(what: str, function: Callable, key: jax.Array, given: State | Params, *dt: float) -> None:
+    """Raise unless a function of a state or of parameters returns one with arrays of the same shapes."""
+    returned = function(key, given, *dt)
     if not _is_own(function):
-        where = _where("a randomization", function)
-        if not isinstance(returned, Params):
-            raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
-        _check_like(where, "parameters", returned, one)
+        where, name = _where(what, function), "params" if isinstance(given, Params) else "state"
+        if not isinstance(returned, type(given)):
+            raise UserError(f"{where} returns {_kind(returned)}; return {name}.replace(...)")
+        _check_like(where, {"params": "parameters", "state": "a state"}[name], returned, given)
 
 
 def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> None:

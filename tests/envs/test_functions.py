@@ -93,6 +93,38 @@ def test_what_a_function_of_a_task_returns_is_refused_where_nothing_can_be_flown
 
 
 @pytest.mark.parametrize(
+    ("option", "function", "said"),
+    [
+        ("noise", lambda key, state: None, r"noise returns None; return state\.replace\(\.\.\.\)"),
+        (
+            "noise",
+            lambda key, state: state.replace(pos=state.pos[0]),
+            r"a state whose pos is .*; give an array \(2, 3\)",
+        ),
+        ("noise", lambda key: None, r"noise: <lambda> takes \(key\); give a function of \(key, state\)"),
+        ("disturbance", lambda key, params, dt: None, r"disturbance returns None; return params\.replace\(\.\.\.\)"),
+        (
+            "disturbance",
+            lambda key, params, dt: params.replace(wind=jnp.zeros(3)),
+            r"parameters whose wind is .*\(2, 3\)",
+        ),
+        ("disturbance", lambda key, params: params, r"takes \(key, params\); give a function of \(key, params, dt\)"),
+    ],
+    ids=range(6),
+)
+def test_noise_and_a_disturbance_are_of_a_team(option, function, said):
+    """A position of one drone would be broadcast to all of the team."""
+    with pytest.raises(UserError, match=said):
+        jd.make("hover", drones=2, **{option: function})
+
+
+@pytest.mark.parametrize("steps", [-1, 2.5, True, "a"])
+def test_a_number_of_steps_that_makes_no_sense_is_refused(steps):
+    with pytest.raises(UserError, match=f"^steps is {steps!r}; give a whole number of at least 0"):
+        dataclasses.replace(jd.make("hover"), steps=steps)
+
+
+@pytest.mark.parametrize(
     ("randomization", "said"),
     [
         (light, r"test_functions.py, line \d+: a randomization returns values that cannot fly: params.mass is -"),

@@ -109,6 +109,18 @@ def test_a_parameter_is_set_by_its_name_and_its_default_is_told():
     assert parameters.answer(3, b"\7" + number) == b"\7" + number + bytes([ENOENT])  # no extended type
 
 
+def test_an_answer_is_a_packet_also_to_a_name_without_an_end():
+    assert len(Parameters(firmware_pid.gains()).answer(3, b"\0" + b"x" * (MAX_DATA - 1))) <= MAX_DATA
+
+
+def test_a_plan_of_any_velocity_is_one_of_numbers():
+    commander = make_commander()
+    for height, velocity in (1e30, 1e-30), (1.0, 1e30):
+        plan(commander, 9, "f?f?f", height, False, 0.0, True, velocity)
+        goal = commander.high_level.trajectory.at(0.5)
+        assert np.isfinite(np.concatenate([goal.pos, goal.vel, goal.acc])).all()
+
+
 def variable(name, kind):
     return struct.pack("<BH", TYPES[kind].log, TOC.names.index(name))
 

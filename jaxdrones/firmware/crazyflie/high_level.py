@@ -16,7 +16,7 @@ MEMORY_BYTES = 4096
 """Size of the memory of trajectories."""
 _ALL_GROUPS = 0
 _IN_MEMORY, _POLYNOMIALS = 1, 0
-_LEAST_DURATION = 0.01  # s
+_LEAST_DURATION, _MOST_DURATION = 0.01, 1e6  # s
 
 _FORMATS: dict[int, tuple[str, str, dict[int, float]]] = {  # command -> name, format, and places of missing values
     0: ("set_group_mask", "B", {}),
@@ -112,7 +112,8 @@ class HighLevel:
 
     def _fly(self, t: float, start: Goal, pos: Any, yaw: float, duration: float, linear: bool = False) -> None:
         self._landing = False
-        self.trajectory = go_to(start, pos, yaw, max(duration, _LEAST_DURATION), t, linear)
+        duration = min(max(duration, _LEAST_DURATION), _MOST_DURATION)
+        self.trajectory = go_to(start, pos, yaw, duration, t, linear)
 
     def _start_trajectory(
         self, t: float, start: Goal, relative: bool, relative_yaw: bool, backwards: bool, number: int, scale: float

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdrones.control.firmware_loops import Gains
-from jaxdrones.firmware.crazyflie.packet import ENOENT
+from jaxdrones.firmware.crazyflie.packet import ENOENT, MAX_DATA
 from jaxdrones.firmware.crazyflie.toc import TYPES, Toc, Type
 
 _TABLE, _READ, _WRITE, _MISC = range(4)
@@ -130,7 +130,7 @@ class Parameters:
             given = f"{group.decode('latin-1')}.{short.decode('latin-1')}"
             known = given in self._entries and typed[:1] == bytes([self._entries[given].kind.parameter])
             error = self._write(given, typed[1:]) if known else ENOENT
-            return data[: len(data) - len(typed)] + bytes([error])
+            return data[: len(data) - len(typed)][: MAX_DATA - 1] + bytes([error])
         if len(data) < 3 or data[0] not in (*_EXTENDED_TYPE, *_DEFAULT, *_PERSISTENT):
             return b""
         name = self._name(data[1:3])

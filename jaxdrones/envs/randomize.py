@@ -155,8 +155,11 @@ def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[boo
 
 
 def with_random_lags(randomize: Sequence[Randomization], params: Params) -> Params:
-    """Parameters with the rotor lags of 1,000 draws of a team, where they are random."""
-    names = ("rotor_rise_time", "rotor_fall_time")
+    """Parameters of a team with the shortest rotor lags of `realistic`, or those of 1,000 draws of the user's own."""
+    realistic = {name: lag for name, lag in _REALISTIC_LAGS.items() if lag in randomize}
+    params = params.replace(**{name: _LAGS[name][0] * getattr(params, name) for name in realistic})
+    randomize = [one for one in randomize if one not in REALISTIC_RANDOMIZATION and not isinstance(one, AnyVehicle)]
+    names = tuple(_LAGS)
     random = jax.tree.unflatten(jax.tree.structure(params), drawn_leaves(randomize, params))
     if not any(getattr(random, name) for name in names):
         return params
@@ -228,6 +231,8 @@ def delayed(actions: Array, steps: float | Array) -> Array:
     return sum((share[:, i, None] * actions[:, i] for i in ages), jnp.zeros((), actions.dtype))
 
 
+_LAGS = {"rotor_rise_time": (0.8, 1.2), "rotor_fall_time": (0.2, 1.2)}
+_REALISTIC_LAGS = {name: scaled(name, *bounds) for name, bounds in _LAGS.items()}
 REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
     scaled("mass", 0.9, 1.1),
     scaled("inertia", 0.8, 1.2),
@@ -235,8 +240,7 @@ REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
     scaled("km", 0.2, 1.2),
     scaled("rotor_pos", 0.95, 1.05),
     scaled("drag_coeff", 0.5, 1.5),
-    scaled("rotor_rise_time", 0.8, 1.2),
-    scaled("rotor_fall_time", 0.2, 1.2),
+    *_REALISTIC_LAGS.values(),
 )
 """Ranges of +-10 or 20 %, wider where published identifications of the Crazyflie differ more.
 

@@ -192,9 +192,8 @@ def make(
             f"{_MAX_STEPS:.0e}"
         )
     assert made.term_sizes  # checks the functions of the task
-    own = [one for one in randomize if one not in REALISTIC_RANDOMIZATION and not isinstance(one, AnyVehicle)]
-    if isinstance(step, ExplicitStep) and step.physics.rotors_lag and own:
-        step.check_lag(with_random_lags(own, nominal))
+    if isinstance(step, ExplicitStep) and step.physics.rotors_lag:
+        step.check_lag(with_random_lags(randomize, nominal))
     return made
 
 

@@ -219,6 +219,13 @@ def test_random_lags_that_are_too_short_for_the_step_are_refused():
             jd.make("hover", randomize=(law,), **options)
 
 
+def test_the_shortest_lags_of_realistic_flights_are_refused_where_they_are_too_short():
+    """A racer whose rotors slow down five times as fast falls by 2.5 times the difference of its speed in 10 ms."""
+    jd.make("follow", vehicle="racer", realistic=True, substeps=3)
+    with pytest.raises(ValueError, match=r"step is 0\.01 s and rotors that lag by 0\.004 s are stable up to 0\.008 s"):
+        jd.make("follow", vehicle="racer", realistic=True)
+
+
 def test_rotors_follow_at_the_longest_step_that_is_not_refused():
     racer = jd.repeat(jd.load_params("racer"), 1)
     step = jd.make_step(rotors=jd.lagging_rotors, dt=1.9 * float(racer.rotor_rise_time[0]))

@@ -18,7 +18,7 @@ from jaxdrones.sensing import Camera, Cylinder, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping, touching
-from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.starts import check_apart, thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.vector import safe_sqrt
 
@@ -28,7 +28,7 @@ _HIGHEST = 4.0  # m; trees are higher, so drones cannot fly over them
 _TREE_HEIGHT = 5.0  # m
 _SPACING = 1.0  # m in y between drones
 _CLEARANCE = 1.5  # m between a tree and a start or goal
-_REACH = (0.0, 0.5, 0.2)  # m: spread of the starts
+_REACH, _REACH_OF_TEAM = (0.0, 0.5, 0.2), (0.0, 0.3, 0.2)  # m: spread of the starts of one drone, and of several
 _BEHIND = 2.0  # m: margin of the strip before the start and beyond the goal
 _MAX_SPEED = 20.0  # m/s
 _LANES = 32  # straight flights for the traversability
@@ -78,9 +78,11 @@ def forest(
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on one side of the forest."""
+        reach = _REACH if drones == 1 else _REACH_OF_TEAM
+        check_apart(params, _SPACING - 2 * reach[1])
         place = jnp.asarray([(0.0, place, HEIGHT) for place in y], params.mass.dtype)
         goal = place + jnp.array([[length, 0, 0]], place.dtype)
-        state = thrown(key, params, place, reach=_REACH, speed=0.5, omega=0.5, tilt=0.2)
+        state = thrown(key, params, place, reach=reach, speed=0.5, omega=0.5, tilt=0.2)
         zero, false = jnp.zeros_like(params.mass), jnp.zeros(drones, bool)
         return state, {
             "goal": goal,

@@ -16,7 +16,7 @@ from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import racetrack, shaping
 from jaxdrones.tasks.racetrack import ARENA, FRAME, GATES, MIDDLE, OPENING, POLES, START
-from jaxdrones.tasks.starts import hovering, standing_height
+from jaxdrones.tasks.starts import check_apart, hovering, standing_height
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
 
@@ -57,6 +57,7 @@ def gates(
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """On the ground at the start of the track, or in the air in front of a random gate."""
+        check_apart(params, _START_SPACING - 2 * start_spread)
         gate_key, place_key, spread_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
         variables = {"gates": racetrack.gates_of(scene, dtype), "poles": racetrack.poles_of(scene, dtype)}

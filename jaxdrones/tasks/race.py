@@ -17,7 +17,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks import centerline, crossing, racetrack, shaping
 from jaxdrones.tasks.pairs import nearest_on_the_way
 from jaxdrones.tasks.racetrack import ARENA, GATES, MIDDLE, OPENING, START
-from jaxdrones.tasks.starts import hovering, standing_height, thrown
+from jaxdrones.tasks.starts import check_apart, hovering, standing_height, thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
 
@@ -71,6 +71,7 @@ def race(
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Any]]:
         """On the ground on a line across the track, or in flight one behind the other."""
+        check_apart(params, _GRID - 2 * _SPREAD)
         grid_key, flight_key, flying_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
         gates = racetrack.gates_of(scene, dtype)

@@ -17,7 +17,7 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
 from jaxdrones.tasks import crossing, shaping, touching
-from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.starts import check_apart, thrown
 from jaxdrones.tasks.task import Drones, Task
 
 HEIGHT = 1.5  # m, of starts and goals
@@ -25,6 +25,7 @@ ROOM_HEIGHT = 3.0  # m
 _BESIDE = 1.0  # m between the places and the walls
 _SPACING = 1.0  # m between neighboring places on the ring
 _CLEARANCE = 0.6  # m between a pillar and a place
+_REACH = 0.1  # m, spread of the starts along each axis
 _ARRIVED = 0.2  # m
 _MAX_SIZE = 1000.0  # m
 
@@ -57,9 +58,10 @@ def room(
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on a ring in the room."""
+        check_apart(params, 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH)
         start_key, order_key = jax.random.split(key)
         places = jnp.asarray(ring, params.mass.dtype)
-        state = thrown(start_key, params, places, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        state = thrown(start_key, params, places, reach=_REACH, speed=0.1, omega=0.1, tilt=0.1)
         goal = jnp.roll(places, jax.random.randint(order_key, (), 1, max(drones, 2)), axis=0)
         goal = -places + jnp.array([[0, 0, 2 * HEIGHT]], goal.dtype) if drones == 1 else goal
         return state, {

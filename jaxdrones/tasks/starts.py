@@ -5,11 +5,14 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
 from jaxdrones.arguments import checked, number
+from jaxdrones.checks import is_concrete
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
@@ -42,6 +45,17 @@ def above_ground(spread: Annotated[float, _SPREAD]) -> Callable[[jax.Array, Para
 
     drawn = f", or up to {lower:g} m lower or {spread:g} m higher" if spread else ""
     return described(f"On a diagonal, 0.1 m above the ground{drawn}, with the rotors standing still.", start)
+
+
+def check_apart(params: Params, apart: float) -> None:
+    """Raise if drones of a known vehicle are wider than the smallest distance (m) between their starts."""
+    if len(params.mass) > 1 and is_concrete(params.collision_radius):
+        width = 2 * float(np.asarray(params.collision_radius).max())
+        if width > apart:
+            raise UserError(
+                f"drones of this vehicle are {width:.3g} m wide and would start in each other, as little as "
+                f"{apart:.3g} m apart; give a smaller vehicle or fewer drones"
+            )
 
 
 def standing_height(params: Params) -> Float[Array, " n"]:

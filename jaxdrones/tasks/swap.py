@@ -10,11 +10,12 @@ from jaxdrones.arguments import Seconds, checked
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import crossing, shaping
-from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.starts import check_apart, thrown
 from jaxdrones.tasks.task import Task, Team
 
 HEIGHT = 2.0  # m
 _MIN_SPACING = 0.6  # m between neighboring places on the ring
+_REACH = 0.1  # m, spread of the starts along each axis
 _SETTLING = 4.0  # s of an episode beyond the straight flight across the ring
 
 
@@ -32,10 +33,11 @@ def swap_goals(drones: Team = 8, duration: Seconds | None = None) -> Task:
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on a ring."""
+        check_apart(params, 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH)
         start_key, order_key = jax.random.split(key)
         angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
-        state = thrown(start_key, params, ring, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        state = thrown(start_key, params, ring, reach=_REACH, speed=0.1, omega=0.1, tilt=0.1)
         goal = jnp.roll(ring, jax.random.randint(order_key, (), 1, drones), axis=0)
         return state, crossing.variables(state, goal)
 

@@ -69,6 +69,14 @@ def test_sizes_at_which_rewards_are_not_finite_or_compiling_does_not_end_are_ref
         TASKS[task](**{option: 10 * most})
 
 
+@pytest.mark.parametrize("task", ["race", "gates", "swap-goals", "forest"])
+def test_drones_that_would_start_in_each_other_are_refused(task):
+    drones = {} if task in ("race", "swap-goals") else {"drones": 2}
+    assert make(task, **drones)
+    with pytest.raises(ValueError, match=r"drones of this vehicle are 0\.76 m wide and would start in each other"):
+        make(task, vehicle="x500", **drones)
+
+
 @pytest.mark.parametrize("option", ["control_hz", "substeps", "delay", "realistic"])
 def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
     optional = ("control_hz", "substeps", "delay")

@@ -137,3 +137,13 @@ def test_traversability_is_the_free_way_in_widths_of_the_drone():
 def test_options_out_of_range_say_so(options, error):
     with pytest.raises(ValueError, match=error):
         make("forest", **options)
+
+
+@pytest.mark.slow
+def test_the_drones_of_a_team_start_apart():
+    """One of a thousand teams of two would touch at once if each drone started half a meter to either side."""
+    env = make("forest", drones=3)
+    pos = jit_unoptimized(jax.vmap(lambda key: env.task.begin(key, env.params, Scene())[0].pos))(
+        jax.random.split(jax.random.key(0), 10_000)
+    )
+    assert jnp.min(pos[:, 1:, 1] - pos[:, :-1, 1]) > 0.4 - 1e-6

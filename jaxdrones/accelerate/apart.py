@@ -87,26 +87,15 @@ def _batched(operands: Sequence, axes: Sequence, *, program: Any, mapped: tuple,
 def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapped: tuple, worlds: int | None) -> tuple:
     """Results, and their changes by the program of the changes of one world."""
     results = _apart.bind(*primals, program=program, mapped=mapped, worlds=worlds)
-    moving = [i for i, tangent in enumerate(tangents) if not compiler.is_zero(tangent)]
-    smooth = [i for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    linear, consts = one_world.changes(program, moving, smooth)
-    operands = [*consts, *primals, *(tangents[i] for i in moving)]
-    mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
-    found = _apart.bind(*operands, program=linear, mapped=mapped, worlds=worlds)
+    operands, params, smooth = one_world.differentiated(program, mapped, primals, tangents, results)
+    found = _apart.bind(*operands, worlds=worlds, **params)
     return results, one_world.replaced([compiler.zero_of(x) for x in results], smooth, found)
 
 
 def _transposed(given: Sequence, *inputs: Any, program: Any, mapped: tuple, worlds: int | None) -> list:
     """Cotangents of the inputs in which the program is linear."""
-    linear = [i for i, x in enumerate(inputs) if compiler.is_linear(x)]
-    known = [i for i in range(len(inputs)) if i not in linear]
-    used = [i for i, x in enumerate(given) if not compiler.is_zero(x)]
-    back, consts = one_world.pulled_back(program, linear, used)
-    operands = [*consts, *(inputs[i] for i in known), *(given[i] for i in used)]
-    varying = (*(False for _ in consts), *(mapped[i] for i in known), *(worlds is not None for _ in used))
-    found = _apart.bind(*operands, program=back, mapped=varying, worlds=worlds)
-    found = [x if worlds is None or mapped[i] else x.sum(axis=0) for i, x in zip(linear, found, strict=True)]
-    return one_world.replaced([None] * len(inputs), linear, found)
+    operands, params, of_inputs = one_world.transposed(program, mapped, worlds, inputs, given)
+    return of_inputs(_apart.bind(*operands, worlds=worlds, **params))
 
 
 if compiler.AVAILABLE:

@@ -3,7 +3,7 @@
 Their operands are the inputs of the program, some with a leading axis over worlds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -60,12 +60,16 @@ def of_worlds(results: Sequence[Array], worlds: int | None, size: int) -> tuple[
     return list(results), [0] * len(results)
 
 
-def changes(program: Any, moving: Sequence[int], smooth: Sequence[int]) -> tuple[Any, list]:
-    """Program of the changes of some results with those of some inputs, and what it closes over.
+def differentiated(
+    program: Any, mapped: Sequence[bool], inputs: Sequence[Array], changes: Sequence, results: Sequence[Array]
+) -> tuple[list, dict[str, Any], list[int]]:
+    """Operands and parameters that compute the changes of results, and the indices of the results that have one.
 
-    Its inputs are those of the program and the changes.
+    The program of the changes has the inputs of the first one, and those of their changes that are not zero.
     """
-    evaluate = compiler.as_function(program, ())
+    evaluate, shapes = compiler.as_function(program, ()), shapes_of(program.invars)
+    moving = [i for i, change in enumerate(changes) if not compiler.is_zero(change)]
+    smooth = [i for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)]
 
     def changed(inputs: list, changes: list) -> list:
         def of_moving(*moved: Array) -> list:
@@ -76,19 +80,24 @@ def changes(program: Any, moving: Sequence[int], smooth: Sequence[int]) -> tuple
             return [jnp.zeros_like(x) for x in of_moving()]
         return jax.jvp(of_moving, [inputs[i] for i in moving], changes)[1]
 
-    shapes = shapes_of(program.invars)
     linear, consts, _ = compiler.trace_open(changed, shapes, [shapes[i] for i in moving])
-    return linear, consts
+    varying = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
+    return [*consts, *inputs, *(changes[i] for i in moving)], dict(program=linear, mapped=varying), smooth
 
 
-def pulled_back(program: Any, linear: Sequence[int], used: Sequence[int]) -> tuple[Any, list]:
-    """Program of the cotangents of the inputs in which a program is linear, and what it closes over.
+def transposed(
+    program: Any, mapped: Sequence[bool], worlds: int | None, inputs: Sequence, given: Sequence
+) -> tuple[list, dict[str, Any], Callable[[Sequence[Array]], list]]:
+    """Operands and parameters that compute the cotangents of the inputs in which a program is linear.
 
-    Its inputs are the other ones and the cotangents of the used results.
+    Also a function from what these give to the cotangents of all inputs; those of a shared input are summed up. The
+    program of the cotangents has the other inputs, and the cotangents of the results that are not zero.
     """
     evaluate, shapes = compiler.as_function(program, ()), shapes_of(program.invars)
-    known = [i for i in range(len(shapes)) if i not in linear]
-    results = shapes_of(program.outvars)
+    linear = [i for i, x in enumerate(inputs) if compiler.is_linear(x)]
+    known = [i for i in range(len(inputs)) if i not in linear]
+    used = [i for i, x in enumerate(given) if not compiler.is_zero(x)]
+    of_results = shapes_of([program.outvars[i] for i in used])
 
     def backward(values: list, given: list) -> list:
         def of_linear(*moved: Array) -> list:
@@ -97,8 +106,15 @@ def pulled_back(program: Any, linear: Sequence[int], used: Sequence[int]) -> tup
 
         return jax.linear_transpose(of_linear, *(shapes[i] for i in linear))(given)
 
-    back, consts, _ = compiler.trace_open(backward, [shapes[i] for i in known], [results[i] for i in used])
-    return back, consts
+    def of_inputs(found: Sequence[Array]) -> list:
+        shared = [worlds is not None and not mapped[i] for i in linear]
+        summed = [x.sum(axis=0) if sums else x for x, sums in zip(found, shared, strict=True)]
+        return replaced([None] * len(inputs), linear, summed)
+
+    back, consts, _ = compiler.trace_open(backward, [shapes[i] for i in known], of_results)
+    varying = (*(False for _ in consts), *(mapped[i] for i in known), *(worlds is not None for _ in used))
+    operands = [*consts, *(inputs[i] for i in known), *(given[i] for i in used)]
+    return operands, dict(program=back, mapped=varying), of_inputs
 
 
 def replaced(values: Sequence, places: Sequence[int], others: Sequence) -> list:

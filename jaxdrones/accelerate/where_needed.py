@@ -112,14 +112,10 @@ def _differentiated(
     results = _where.bind(*primals, program=program, rest=rest, mapped=mapped, **params)
     needed, inputs = primals[0], primals[1 + rest :]
     of_otherwise, changes = tangents[1 : 1 + rest], tangents[1 + rest :]
-    moving = [i for i, change in enumerate(changes) if not compiler.is_zero(change)]
-    smooth = [i for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    linear, consts = one_world.changes(program, moving, smooth)
+    operands, of_changes, smooth = one_world.differentiated(program, mapped, inputs, changes, results)
     still = all(map(compiler.is_zero, of_otherwise))
     kept = [] if still else [compiler.instantiated(of_otherwise[i]) for i in smooth]
-    operands = [*kept, *consts, *inputs, *(changes[i] for i in moving)]
-    mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
-    found = _where.bind(needed, *operands, program=linear, rest=len(kept), mapped=mapped, **params)
+    found = _where.bind(needed, *kept, *operands, rest=len(kept), **of_changes, **params)
     return results, one_world.replaced([compiler.zero_of(x) for x in results], smooth, found)
 
 
@@ -128,19 +124,13 @@ def _transposed(
 ) -> list:
     """Cotangents of `otherwise`, and of the inputs in which the program is linear."""
     otherwise, inputs = inputs[:rest], inputs[rest:]
-    linear = [i for i, x in enumerate(inputs) if compiler.is_linear(x)]
-    known = [i for i in range(len(inputs)) if i not in linear]
-    used = [i for i, x in enumerate(given) if not compiler.is_zero(x)]
-    back, consts = one_world.pulled_back(program, linear, used)
-    operands = [*consts, *(inputs[i] for i in known), *(given[i] for i in used)]
-    has_worlds = params["worlds"] is not None
-    varying = (*(False for _ in consts), *(mapped[i] for i in known), *(has_worlds for _ in used))
-    found = _where.bind(needed, *operands, program=back, rest=0, mapped=varying, **params)
-    found = [x.sum(axis=0) if has_worlds and not mapped[i] else x for i, x in zip(linear, found, strict=True)]
-    of_otherwise = [
-        _unneeded(needed, given[i]) if compiler.is_linear(x) and i in used else None for i, x in enumerate(otherwise)
+    operands, of_cotangents, of_inputs = one_world.transposed(program, mapped, params["worlds"], inputs, given)
+    found = _where.bind(needed, *operands, rest=0, **of_cotangents, **params)
+    unneeded = [
+        _unneeded(needed, x) if compiler.is_linear(other) and not compiler.is_zero(x) else None
+        for other, x in zip(otherwise, given[:rest], strict=True)
     ]
-    return [None, *of_otherwise, *one_world.replaced([None] * len(inputs), linear, found)]
+    return [None, *unneeded, *of_inputs(found)]
 
 
 def _unneeded(needed: Array, value: Array) -> Array:

@@ -40,7 +40,7 @@ def room(
     """Drones on a ring in a room exchange places without collisions with each other, walls or pillars.
 
     Args:
-        drones: number of drones; they start 1 m or more apart.
+        drones: number of drones; their places are 1 m or more apart along the ring.
         pillars: number of random pillars; those too close to a start or a goal are left out.
         size: length and width of the room, m; at most 1,000.
         duration: duration of an episode, s.

@@ -41,6 +41,8 @@ _OPERATIONS = {
 """Names of CasADi's operations, without `OP_` -> JavaScript."""
 _CODES = {getattr(casadi, f"OP_{name}"): text for name, text in _OPERATIONS.items()}
 
+_NOT_FINITE = {"inf": "Infinity", "-inf": "-Infinity", "nan": "NaN"}
+
 
 def javascript(name: str, function: Callable, **arguments: Any) -> str:
     """Text of a JavaScript function of arrays of numbers for a traceable function of pytrees of arrays.
@@ -67,7 +69,7 @@ def javascript(name: str, function: Callable, **arguments: Any) -> str:
 def _line(program: Any, k: int, names: list[str]) -> str:
     code, inputs, outputs = program.instruction_id(k), program.instruction_input(k), program.instruction_output(k)
     if code == casadi.OP_CONST:
-        return f"w{outputs[0]} = {program.instruction_constant(k)!r}"
+        return f"w{outputs[0]} = {_NOT_FINITE.get(constant := repr(program.instruction_constant(k)), constant)}"
     if code == casadi.OP_INPUT:
         return f"w{outputs[0]} = {names[inputs[0]]}[{inputs[1]}]"
     if code == casadi.OP_OUTPUT:

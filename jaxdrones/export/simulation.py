@@ -1,6 +1,7 @@
 """Simulation of drones in a web page: physics, controllers and a policy as JavaScript, without a server."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -78,10 +79,12 @@ def simulation(policy: Policy, env: Env, drones: Annotated[int, whole("number of
     """Simulation of the nominal vehicle of an environment, which a policy or controllers fly to a target.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
-    external force (N, world). The drones do not interact; each flies to its own goal.
+    external force (N, world), without the noise and the disturbances of the environment. The drones do not interact;
+    each flies to its own goal.
 
     Raises:
-        ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.
+        ValueError: a team, images, sensors, a load or another model, a delay, other rotors, a target that moves, or a
+            policy with memory.
         ImportError: without casadi (extra `casadi`).
     """
     _check(policy, env)
@@ -136,9 +139,26 @@ def _check(policy: Policy, env: Env) -> None:
         "it has a memory": bool(jax.tree.leaves(initial_hidden_state(policy, 1))),
         "the backend is Bullet": isinstance(env.physics, HostStep),
         "its rotors are not instant": env.physics.physics.rotors is not instant_rotors,
+        "it has a load or another model with a state": bool(env.physics.physics.models),
     }
+    if not any(reasons.values()):
+        reasons["its target moves"] = bool(jax.jit(functools.partial(_target_moves, env))(jax.random.key(0)))
     if found := [reason for reason, holds in reasons.items() if holds]:
         raise UserError(f"the page cannot fly this policy: {', '.join(found)}; give the policy of hover, for example")
+
+
+def _target_moves(env: Env, key: jax.Array) -> Array:
+    """Whether the target of a task depends on time, or is another one after a drone has flown through it."""
+    _, world = env.reset(key)
+    first = env.task.target_now(world).pos
+    places = [env.task.target_now(world.replace(step=world.step + steps)).pos for steps in (1, env.steps // 2)]
+    for sign, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
+        direction, flown = jnp.zeros_like(first).at[:, axis].set(sign), world
+        for pos in (first - direction, first + direction):
+            flown = flown.replace(drones=flown.drones.replace(pos=pos))
+            flown = flown.replace(variables=env.task.advance(env.task, flown))
+        places.append(env.task.target_now(flown).pos)
+    return jnp.any(jnp.stack(places) != first[None])
 
 
 def _numbers(tree: Any) -> list[float]:
@@ -174,14 +194,14 @@ def _policy(policy: Policy, env: Env) -> tuple[Callable, int, Any, Any]:
     Its memory are the latest actions, which it may observe, and the memory of the action type.
     """
     _, world = env.reset(jax.random.key(0))
-    target = env.task.target_now(world).pos[0]
+    target, calm = env.task.target_now(world).pos[0], dataclasses.replace(env, disturbance=None)
 
     def fly(gains: Any, memory: Any, state: State, goal: Float[Array, "3"]) -> tuple[Any, Array]:
         actions, of_action_type = memory
         drones = jax.tree.map(lambda x: x[None], state)
         drones = drones.replace(pos=(state.pos - goal + target)[None])
         seen = world.replace(drones=drones, actions=actions, memory=of_action_type)
-        after, rpm = episode.command(env, None, seen, policy(observe(env.terms, env.task, seen)))
+        after, rpm = episode.command(calm, None, seen, policy(observe(env.terms, env.task, seen)))
         return (after.actions, after.memory), rpm[0]
 
     return fly, env.physics.substeps, (), (world.actions, world.memory)

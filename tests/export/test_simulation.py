@@ -1,5 +1,6 @@
 """What a page simulates is what JAX simulates."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -237,3 +238,38 @@ def test_one_of_several_drones_is_pulled_and_all_are_kicked(env, tmp_path):
         tab.wait(f"Math.min(...{away}) > 0.2")
         tab.wait(f"Math.max(...{away}) < 0.05")
         assert tab.problems == []
+
+
+def test_numbers_that_are_not_finite_are_numbers_of_javascript():
+    from jaxdrones.export.equations import javascript
+
+    text = javascript("f", lambda x: jnp.where(x > 0, jnp.array([jnp.inf, -jnp.inf, jnp.nan]), x), x=jnp.zeros(3))
+    found = in_node(f"(() => {{ {text}\nconst out = []; f(out, a); return out.map(String); }})()", [1.0, 1.0, 1.0])
+    assert found.tolist() == ["Infinity", "-Infinity", "NaN"]
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        ("sling", "it has a load or another model"),
+        pytest.param("tracking", "its target moves", marks=pytest.mark.slow),
+        pytest.param("gates", "its target moves", marks=pytest.mark.slow),
+    ],
+)
+def test_a_page_of_a_task_that_it_does_not_simulate_is_refused(task, reason):
+    from jaxdrones.export.simulation import _check
+
+    with pytest.raises(ValueError, match=reason):
+        _check(lambda obs: jnp.zeros((1, 4)), jd.make(task))
+
+
+def test_the_policy_of_a_page_flies_without_the_disturbance_of_its_environment(env, monkeypatch):
+    """Its draws need a random key, which the page has not."""
+    from jaxdrones.export import simulation
+
+    windy = dataclasses.replace(env, disturbance=jd.dryden(7.7))
+    world = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(env.reset, jax.random.key(0))[1])
+    monkeypatch.setattr(type(windy), "reset", lambda *_: (None, world))
+    fly, _, gains, memory = simulation._policy(lambda obs: jnp.zeros((1, 4)), windy)
+    state = jax.tree.map(lambda x: x[0], world.drones)
+    assert jax.eval_shape(fly, gains, memory, state, jnp.zeros(3))[1].shape == (4,)

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.compiler import CALLS, Equation, is_literal
-from jaxdrones.optimal.primitives import ELEMENTWISE, REDUCTIONS, casadi, select
+from jaxdrones.optimal.primitives import ELEMENTWISE, REDUCTIONS, casadi, converted, select, truncated
 
 _MOVES = frozenset(  # primitives that rearrange the entries of their inputs
     "broadcast_in_dim concatenate copy gather pad reshape rev slice split squeeze stack transpose "
@@ -23,7 +23,7 @@ _MOVES = frozenset(  # primitives that rearrange the entries of their inputs
 )
 _MOVED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}  # others: indices
 _UNCHANGED = frozenset(  # primitives that leave values unchanged
-    "convert_element_type stop_gradient optimization_barrier copy_start copy_done reduce_precision name "
+    "stop_gradient optimization_barrier copy_start copy_done reduce_precision name "
     "xla_metadata_value".split()
 )
 
@@ -77,6 +77,11 @@ def _evaluate_equation(equation: Equation, inputs: list[np.ndarray]) -> list[np.
         return evaluate(*compiler.called(equation), inputs)
     if not any(map(_is_symbolic, inputs)):
         return [np.asarray(x) for x in compiler.evaluated(equation, [jnp.asarray(x) for x in inputs])]
+    if name == "convert_element_type":
+        conversion = converted(np.dtype(equation.invars[0].aval.dtype), np.dtype(params["new_dtype"]))
+        return inputs if conversion is None else [_elementwise(conversion, inputs)]
+    if name == "div" and np.dtype(equation.invars[0].aval.dtype).kind in "iu":
+        return [_elementwise(lambda x, y: truncated(x / y), inputs)]
     if name in _UNCHANGED:
         return inputs
     if name in _MOVES:

@@ -5,6 +5,8 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from jaxdrones.errors import install
 
 try:
@@ -27,6 +29,27 @@ def select(which: Any, *cases: Any) -> Any:
 def _integer_pow(x: Any, y: int, **_: Any) -> Any:
     product = functools.reduce(operator.mul, [x] * abs(y), 1.0)
     return product if y >= 0 else 1 / product
+
+
+def _round(x: Any, rounding_method: Any, **_: Any) -> Any:
+    """Nearest integer; halves to even numbers, or away from zero, as in JAX."""
+    if int(rounding_method) == 0:  # away from zero
+        return casadi.sign(x) * casadi.floor(casadi.fabs(x) + 0.5)
+    nearest = casadi.floor(x + 0.5)
+    is_odd_half = casadi.logic_and(nearest - x == 0.5, nearest != 2 * casadi.floor(nearest / 2))
+    return nearest - is_odd_half
+
+
+def truncated(x: Any) -> Any:
+    """Integer part of a number."""
+    return casadi.sign(x) * casadi.floor(casadi.fabs(x))
+
+
+def converted(old: np.dtype, new: np.dtype) -> Callable[[Any], Any] | None:
+    """Conversion of a number to another type; `None` where it keeps the value."""
+    if new.kind == "b" != old.kind:
+        return lambda x: x != 0
+    return truncated if new.kind in "iu" and old.kind not in "biu" else None
 
 
 def _of_two(function: Callable) -> Callable:
@@ -59,7 +82,7 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "neg": _of_one(operator.neg),
     "not": _of_one(casadi.logic_not),
     "or": _of_two(casadi.logic_or),
-    "round": _of_one(lambda x: casadi.floor(x + 0.5)),
+    "round": _round,
     "rsqrt": _of_one(lambda x: 1 / casadi.sqrt(x)),
     "square": _of_one(lambda x: x * x),
     "xor": _of_two(operator.ne),

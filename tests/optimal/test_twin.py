@@ -156,3 +156,19 @@ def test_a_library_that_is_not_installed_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r"casadi is not installed; pip install "):
         twin("cf2x")
+
+
+def test_conversions_and_rounding_on_symbols_are_those_of_jax():
+    """Truncation to integers, zero or not, halves to even numbers or away from zero, and division of integers."""
+    from jaxdrones.optimal.interpreter import on_symbols
+    from jaxdrones.optimal.primitives import casadi
+
+    def function(x):
+        whole = x.astype(int)
+        away = jax.lax.round(x, jax.lax.RoundingMethod.AWAY_FROM_ZERO)
+        return whole, jnp.where(x.astype(bool), 3.0, 4.0), jnp.round(x), away, jax.lax.div(whole, jnp.full_like(whole, 2))
+
+    x = np.array([-3.7, -2.5, -1.5, -0.5, -0.2, 0.0, 0.4, 0.5, 1.5, 2.5, 3.5, 5.9])
+    (symbols,), result = on_symbols(function, x=jnp.asarray(x))
+    found = casadi.Function("f", [symbols], [result])(x.tolist()).full().ravel()
+    np.testing.assert_array_equal(found, np.concatenate([np.asarray(y, float) for y in jax.jit(function)(x)]))

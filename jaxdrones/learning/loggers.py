@@ -15,6 +15,8 @@ from typing import Any
 
 import jax
 
+from jaxdrones import writing
+from jaxdrones.arguments import Count, checked
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning.evaluation import Report, compile_evaluation
@@ -22,7 +24,10 @@ from jaxdrones.learning.networks import Policy
 
 
 class CSV:
-    """Log to a CSV file: a row per update, with the columns `update` and the metrics of the first update."""
+    """Log to a CSV file: a row per update, with the columns `update` and the metrics of the first update.
+
+    A training that continues from a state keeps the rows of earlier updates in the file.
+    """
 
     def __init__(self, path: str | os.PathLike):
         self._path = Path(path)
@@ -32,11 +37,23 @@ class CSV:
     def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
         """Append the metrics of an update."""
         row = {"update": update} | metrics
-        with self._path.open("a" if self._columns else "w", newline="") as file:
-            if not self._columns:
-                self._columns = list(row)
-                csv.writer(file).writerow(self._columns)
+        if not self._columns:
+            self._columns = list(row)
+            earlier = self._rows_before(update)
+            with writing.replaced(self._path) as new, new.open("w", newline="") as file:
+                csv.writer(file).writerows([self._columns, *earlier])
+        with self._path.open("a", newline="") as file:
             csv.writer(file).writerow([row.get(name, "") for name in self._columns])
+
+    def _rows_before(self, update: int) -> list[list[str]]:
+        """Rows of the file of updates before this one."""
+        if update <= 1 or not self._path.exists():
+            return []
+        with self._path.open(newline="") as file:
+            columns, *rows = [*csv.reader(file)] or [[]]
+        if columns != self._columns:
+            raise UserError(f"{self._path} has the columns {', '.join(columns) or 'of no log'}; give another file")
+        return [row for row in rows if row and row[0].isdecimal() and int(row[0]) < update]
 
 
 class TensorBoard:
@@ -83,7 +100,8 @@ class KeepBest:
     report: Report | None = None
     """Evaluation of that policy."""
 
-    def __init__(self, env: Env, key: jax.Array, every: int = 20, episodes: int = 200):
+    @checked
+    def __init__(self, env: Env, key: jax.Array, every: Count = 20, episodes: Count = 200):
         """Evaluate in `env` after `every` updates, in the same `episodes` of a random key for all policies."""
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function
-from jaxdrones.checks import is_concrete
+from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -82,9 +82,19 @@ class OwnNetwork:
             return self.module.init(key, *state, example)
         return tuple(jnp.asarray(x) for x in self._leaves if _is_trained(x))
 
-    def restored(self, params: dict[str, Any]) -> Any:
-        """Parameters from a file, where tuples are dictionaries."""
-        return params if isinstance(self.module, nn.Module) else tuple(params[str(i)] for i in range(len(params)))
+    def restored(self, params: dict[str, Any], per_agent: bool = False) -> Any:
+        """Parameters from a file, where tuples are dictionaries, possibly a set for each drone.
+
+        Raises:
+            ValueError: arrays of other shapes than those of an nnx or equinox module.
+        """
+        if isinstance(self.module, nn.Module):
+            return params
+        arrays = tuple(params[str(i)] for i in range(len(params)))
+        found, own = ([np.shape(x) for x in xs] for xs in (arrays, filter(_is_trained, self._leaves)))
+        if [shape[per_agent:] for shape in found] != own:
+            raise UserError(f"network has arrays {short_repr(own)}, the policy {short_repr(found)}; give its network")
+        return arrays
 
     def with_params(self, params: Any) -> Callable:
         """Module with other parameters; for linen a function that applies it."""

@@ -15,12 +15,12 @@ from jaxtyping import Array, Int
 
 from jaxdrones.accelerate.compiler import is_inside_jit
 from jaxdrones.arguments import Key, Scalar, checked
-from jaxdrones.checks import is_concrete
+from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.metrics import with_unknown, without_unknown
-from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.networks import OwnNetwork, Policy
 from jaxdrones.learning.settings import Config, check_config
 from jaxdrones.pytree import PyTreeNode
 
@@ -119,15 +119,21 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             network: a flax linen, flax nnx or equinox module in place of the network of the settings; see
                 `learning.networks.OwnNetwork`.
             callback: function, or several, called after every update; see `Callback`.
-            state: state to continue from, the `train_state` of a result; up to `config.updates` updates in total.
+            state: state to continue from, the `train_state` of a result with the same worlds, network and episodes; up
+                to `config.updates` updates in total.
 
         Raises:
-            ValueError: no random key, the settings of another learner, or a state without updates left.
+            ValueError: no random key, the settings of another learner, or a state that does not fit them or is without
+                updates left.
             Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised;
                 see `history["nonfinite_gradients"]`.
         """
         check_config(config, kind)
-        callbacks = (callback,) if callable(callback) else tuple(callback)
+        callbacks = (callback,) if callable(callback) else tuple(callback or ())
+        if not all(map(callable, callbacks)):
+            raise UserError(f"callback is {short_repr(callback)}; give functions (update, metrics, state)")
+        if state is not None:
+            _check_state(state, functools.partial(init, env=env, config=config), network)
         if is_inside_jit() or not all(map(is_concrete, (key, *vars(config).values()))):
             if callbacks:
                 raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
@@ -158,6 +164,27 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
 
     train.__module__, train.__qualname__ = kind.__module__, "train"
     return checked(train)
+
+
+def _check_state(state: Any, init: Callable, network: Any) -> None:
+    """Raise unless a training of the network can continue from a state, whose shapes are then those of `init(key)`."""
+    if not isinstance(state, TrainState):
+        raise UserError(f"state is {short_repr(state)}; give the train_state of a result")
+    if network is None and isinstance(state.policy.network, OwnNetwork):
+        network = state.policy.network.module
+    expected = jax.eval_shape(lambda: init(jax.random.key(0), network=network))
+    if type(state) is not type(expected):
+        raise UserError(f"state is of {type(state).__module__}; give one of {type(expected).__module__}")
+    shapes, found = (
+        {jax.tree_util.keystr(path): jnp.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(tree)}
+        for tree in (expected, state)
+    )
+    for name in shapes | found:
+        if shapes.get(name) != found.get(name):
+            raise UserError(
+                f"state{name} has shape {found.get(name, 'none')}, expected {shapes.get(name, 'none')}; continue with "
+                "the environment, the worlds and the network that the state was trained with"
+            )
 
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:

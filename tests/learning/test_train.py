@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import sys
 import types
 
@@ -206,3 +207,58 @@ def test_a_policy_whose_return_is_no_number_is_replaced_by_any_other(monkeypatch
     for update in returns:
         best(update, {}, types.SimpleNamespace(policy=update))
     assert best.policy == 2
+
+
+def test_a_state_that_does_not_fit_is_refused():
+    """Other worlds, other networks, another learner, and what is no state."""
+    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[bptt], updates=5)
+    state = bptt.init(KEY, env, config)
+    for wrong, change, said in (
+        (state, {"worlds": 2 * config.worlds}, r"state\S+ has shape \(\d+,.*, expected"),
+        (state, {"hidden_sizes": (5,)}, r"state.policy\S+ has shape .*, expected .*; continue with the environment"),
+        (ppo.init(KEY, env, SMALL[ppo]), {}, "state is of jaxdrones.learning.ppo; give one of"),
+        (state.policy, {}, "state is <Policy .*; give the train_state of a result"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            bptt.train(KEY, env, dataclasses.replace(config, **change), state=wrong)
+
+
+def test_a_callback_that_is_no_function_is_refused():
+    with pytest.raises(ValueError, match=r"callback is \[3\]; give functions"):
+        bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], callback=[3])
+
+
+def test_the_log_of_a_continued_training_keeps_the_rows_of_earlier_updates(tmp_path):
+    """Without those that it makes again; a log with other columns stays as it is."""
+    file = tmp_path / "log.csv"
+    for updates in ((1, 2, 3), (3, 4)):
+        log = loggers.CSV(file)
+        for update in updates:
+            log(update, {"reward": 10.0 * len(updates) + update})
+    assert file.read_text().split() == ["update,reward", "1,31.0", "2,32.0", "3,23.0", "4,24.0"]
+    with pytest.raises(ValueError, match="has the columns update, reward; give another file"):
+        loggers.CSV(file)(5, {"error": 1.0})
+    assert len(file.read_text().split()) == 5
+    loggers.CSV(file)(1, {"error": 1.0})
+    assert file.read_text().split() == ["update,error", "1,1.0"]
+
+
+@pytest.mark.parametrize("name", ["every", "episodes"])
+def test_evaluations_that_make_no_sense_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} is 0; give a whole number of at least 1"):
+        loggers.KeepBest(None, KEY, **{name: 0})
+
+
+def test_a_policy_is_not_loaded_into_a_network_of_other_arrays(tmp_path):
+    """Fewer layers took the first arrays of the policy."""
+
+    def network(*sizes):
+        layers = [nnx.Linear(a, b, rngs=nnx.Rngs(0)) for a, b in itertools.pairwise(sizes)]
+        return NnxNetwork([(layer.kernel[...], layer.bias[...]) for layer in layers])
+
+    policy = Policy.init(KEY, DoubleIntegrator(), network=network(*SIZES), per_agent=True)
+    checkpoint.save(tmp_path / "policy", policy)
+    assert checkpoint.load(tmp_path / "policy", network(*SIZES)).per_agent
+    for sizes in (2, 8), (2, 4, 1), (2, 8, 8, 1):
+        with pytest.raises(ValueError, match=r"network has arrays .*, the policy \[.*; give its network"):
+            checkpoint.load(tmp_path / "policy", network(*sizes))

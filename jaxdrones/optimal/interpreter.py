@@ -23,8 +23,7 @@ _MOVES = frozenset(  # primitives that rearrange the entries of their inputs
 )
 _MOVED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}  # others: indices
 _UNCHANGED = frozenset(  # primitives that leave values unchanged
-    "stop_gradient optimization_barrier copy_start copy_done reduce_precision name "
-    "xla_metadata_value".split()
+    "stop_gradient optimization_barrier copy_start copy_done reduce_precision name xla_metadata_value".split()
 )
 
 

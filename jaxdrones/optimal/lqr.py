@@ -12,8 +12,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Weights, check_plan, hover, reference
-from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.optimal.problem import Weights, check_plan, checked_weights, hover, reference
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -42,7 +41,7 @@ class Memory(PyTreeNode):
 
 def settings(step: Any, weights: Weights | None = None) -> Settings:
     """Settings of a regulator, with the weights of the errors, by default `problem.weights()`."""
-    return Settings(default_weights() if weights is None else weights, step)
+    return Settings(checked_weights(weights), step)
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:

@@ -13,8 +13,7 @@ from jaxdrones.control.single import OneState
 from jaxdrones.optimal.coordinates import tracking_error
 from jaxdrones.optimal.interpreter import on_symbols
 from jaxdrones.optimal.primitives import casadi
-from jaxdrones.optimal.problem import Horizon, Weights, check_plan, reference
-from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.optimal.problem import Horizon, Weights, check_plan, checked_weights, reference
 from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -74,7 +73,7 @@ class Mpc:
         self._scale = np.array([self._unit if name.startswith("rpm") else 1.0 for name in model.names])[self._kept]
         self._plan: np.ndarray | None
         self.reset()
-        self._write(dt, default_weights() if weights is None else weights, terminal, solver)
+        self._write(dt, checked_weights(weights), terminal, solver)
 
     def _write(self, dt: float, weights: Weights, terminal: float, solver: str) -> None:
         model, n = self.model, len(self._kept)

@@ -19,8 +19,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Horizon, Reference, Weights, hover, posed
-from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -71,7 +70,7 @@ def settings(
     between samples of the noise: noise at every step hardly moves a drone.
     """
     return Settings(
-        default_weights() if weights is None else weights,
+        checked_weights(weights),
         step,
         horizon,
         noise=jnp.array([0.05, 0.02, 0.02, 0.02]),

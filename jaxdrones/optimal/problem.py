@@ -5,11 +5,12 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
 from jaxdrones.arguments import whole
-from jaxdrones.checks import check_shape, is_concrete
+from jaxdrones.checks import check_shape, is_concrete, short_repr
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
@@ -57,6 +58,24 @@ def weights() -> Weights:
         omega=jnp.full(3, 0.01),
         command=jnp.full(4, 10.0),
     )
+
+
+def checked_weights(given: Weights | None) -> Weights:
+    """Weights, by default those of `weights`.
+
+    Raises:
+        ValueError: a wrong shape, a negative number, or a command that costs nothing, so that no command is the best.
+    """
+    if given is None:
+        return weights()
+    for name, size in (("pos", 3), ("attitude", 3), ("vel", 3), ("omega", 3), ("command", 4)):
+        x = getattr(given, name)
+        check_shape(f"weights.{name}", x, (size,), "a weight for each axis" if size == 3 else "a weight for each rotor")
+        least = jnp.finfo(float).tiny if name == "command" else 0
+        if is_concrete(x) and not np.all(np.isfinite(x) & (np.asarray(x) >= least)):
+            wanted = "positive, finite numbers" if least else "finite numbers of at least 0"
+            raise UserError(f"weights.{name} is {short_repr(x)}; give {wanted}")
+    return given
 
 
 class Reference(PyTreeNode):

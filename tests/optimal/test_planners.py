@@ -313,3 +313,18 @@ def test_every_curve_is_tracked_closer_than_by_pid(module):
     found = flown(memory, planned)
     assert np.all(found < 0.5 * flown(for_team(pid.init(), worlds), by_pid)), found
     assert np.all(found < 0.015)
+
+
+@pytest.mark.parametrize("module", [lqr, ilqr, mppi])
+def test_weights_that_have_no_best_command_are_refused(module):
+    """Commands that cost nothing had gains of NaN, and weights of a wrong length were those of another error."""
+    known = optimal.weights()
+    for name, value, said in (
+        ("command", jnp.zeros(4), r"weights.command is .*; give positive, finite"),
+        ("vel", jnp.array([1.0, jnp.nan, 1.0]), r"weights.vel is .*; give finite numbers of at least 0"),
+        ("omega", -known.omega, r"weights.omega is .*; give finite numbers of at least 0"),
+        ("pos", jnp.ones(2), r"weights.pos has shape \(2,\); expected \(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            module.settings(_step(), known.replace(**{name: value}))
+    assert module.settings(_step(), known.replace(pos=jnp.zeros(3))).weights.pos[0] == 0

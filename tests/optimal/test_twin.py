@@ -166,7 +166,13 @@ def test_conversions_and_rounding_on_symbols_are_those_of_jax():
     def function(x):
         whole = x.astype(int)
         away = jax.lax.round(x, jax.lax.RoundingMethod.AWAY_FROM_ZERO)
-        return whole, jnp.where(x.astype(bool), 3.0, 4.0), jnp.round(x), away, jax.lax.div(whole, jnp.full_like(whole, 2))
+        return (
+            whole,
+            jnp.where(x.astype(bool), 3.0, 4.0),
+            jnp.round(x),
+            away,
+            jax.lax.div(whole, jnp.full_like(whole, 2)),
+        )
 
     x = np.array([-3.7, -2.5, -1.5, -0.5, -0.2, 0.0, 0.4, 0.5, 1.5, 2.5, 3.5, 5.9])
     (symbols,), result = on_symbols(function, x=jnp.asarray(x))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.arguments import Count, checked
 from jaxdrones.checks import check_choice
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
@@ -42,12 +43,13 @@ def choose_renderer(renderer: str | None, path: Path) -> str:
     return renderer
 
 
+@checked
 def film(
     record: FlightLog,
     path: Path,
     title: str,
     renderer: str | None = None,
-    fps: int = FPS,
+    fps: Count = FPS,
     size: tuple[int, int] = SIZE,
     on_frame: Callable[[float], Any] = lambda share: None,
 ) -> int:
@@ -61,6 +63,7 @@ def film(
         ValueError: a missing dependency, or no finite state in the flight.
         OSError: the film cannot be written.
     """
+    video.check_video(path, fps)
     frames = _frames(choose_renderer(renderer, path), record, title, fps, size)
 
     def reported() -> Iterator[np.ndarray]:
@@ -85,7 +88,10 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
     return replay.frames(record, fps, size)
 
 
-def film_page(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit") -> int:
+@checked
+def film_page(
+    page: Page, path: Path, fps: Count = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit"
+) -> int:
     """Write a film of a page, one frame per 1/fps of simulated time, in a few tenths of a second each.
 
     Args:
@@ -102,7 +108,7 @@ def film_page(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (12
         ValueError: an unknown suffix, a package that is not installed, or no browser.
         OSError: the film cannot be written.
     """
-    video.check_video(path)
+    video.check_video(path, fps)
     with contextlib.closing(page_frames(page, fps, size, camera)) as pictures:
         return video.write(pictures, path, fps)
 

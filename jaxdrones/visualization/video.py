@@ -11,12 +11,17 @@ from jaxdrones.errors import UserError, install
 from jaxdrones.writing import replaced
 
 SUFFIXES = (".mp4", ".gif")
+_FASTEST_GIF = 50  # frames per second; browsers show a frame of less than 2/100 s for 1/10 s
 
 
-def check_video(path: Path) -> None:
-    """Raise `ValueError` for an unknown suffix or a package that is not installed."""
+def check_video(path: Path, fps: int = 1) -> None:
+    """Raise `ValueError` for an unknown suffix, too many frames per second or a package that is not installed."""
     if path.suffix not in SUFFIXES:
         raise UserError(f"{path}: films end in {' or '.join(SUFFIXES)}")
+    if path.suffix == ".gif" and fps > _FASTEST_GIF:
+        raise UserError(
+            f"{path}: a GIF has at most {_FASTEST_GIF} frames per second, not {fps}; give fewer, or an .mp4"
+        )
     try:
         import PIL  # noqa: F401
 

@@ -139,3 +139,12 @@ def test_the_page_films_where_there_is_a_browser_and_jax_elsewhere(monkeypatch, 
         films.choose_renderer("page", tmp_path / "film.gif")
     with pytest.raises(ValueError, match="unknown renderer 'pge'; did you mean 'page'"):
         films.choose_renderer("pge", tmp_path / "film.gif")
+
+
+@pytest.mark.parametrize(
+    ("fps", "says"), [(0, "fps is 0; give a whole"), (51, "a GIF has at most 50 frames per second, not 51")]
+)
+def test_frames_that_no_film_can_show_in_time_are_refused(fps, says, record, tmp_path):
+    for make in (films.film, films.film_page):
+        with pytest.raises(ValueError, match=says):
+            make(record, tmp_path / "film.gif", *["title"] * (make is films.film), fps=fps)

@@ -284,3 +284,33 @@ def test_loads_on_cables_are_in_the_page_and_in_a_log(team, tmp_path):
     (record,) = records_of(carried, {"params": team, "dt": 0.01, "targets": None, "labels": None, "images": None})
     save_npz(record, tmp_path / "log.npz")
     np.testing.assert_array_equal(read_log(tmp_path / "log.npz").load_pos, load.pos)
+
+
+def test_a_trajectory_of_other_shapes_and_an_empty_one_are_refused(team):
+    flown = trajectory(team)
+    for wrong, said in (
+        (flown.replace(quat=flown.quat[..., :3]), r"quat of the trajectory has shape \(20, 3, 3\); give \(20, 3, 4\)"),
+        (flown.replace(vel=flown.vel[:5]), r"vel of the trajectory has shape \(5, 3, 3\); give \(20, 3, 3\)"),
+        (jax.tree.map(lambda x: x[:0], flown), "give at least one time, drone and world"),
+        (jax.tree.map(lambda x: x[None][:0], flown), "give at least one time, drone and world"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            show(wrong, team, dt=0.1)
+    with pytest.raises(ValueError, match=r"labels is 'abc'; give a sequence, for example \('left',\)"):
+        show(flown, team, dt=0.1, labels="abc")
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames", "says"),
+    [
+        ("rgb", np.full((20, 3, 4, 4, 3), 0.5), "type float64; give uint8, from 0 to 255"),
+        ("rgb", np.full((20, 3, 4, 4, 3), 300), "type int64; give uint8, from 0 to 255"),
+        ("rgb", np.zeros((20, 3, 4, 4, 2), np.uint8), r"shape .*; give \(K, n, height, width, 3 or 4\)"),
+        ("segmentation", np.zeros((20, 3, 4, 4)), "type float64; give whole numbers"),
+        ("depth", np.zeros((20, 3, 0, 4)), r"shape .*; give \(K, n, height, width\)"),
+    ],
+)
+def test_images_of_other_numbers_are_refused(team, kind, frames, says):
+    """Colors from 0 to 1 were shown as black, and 300 as 44."""
+    with pytest.raises(ValueError, match=f"images '{kind}' .* {says}"):
+        show(trajectory(team), team, dt=0.1, images={kind: frames})

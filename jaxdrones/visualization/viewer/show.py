@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import check_choice, check_number, check_params, short_repr
+from jaxdrones.checks import check_choice, check_number, check_params, check_sequence, short_repr
 from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
@@ -30,6 +30,12 @@ LAYOUTS = {"ghosts": "ghosts", "side by side": "grid", "hidden": "alone"}
 """Initial layouts of other worlds -> names in the page."""
 CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
 """Kinds of images -> whether a pixel has channels."""
+_WIDTHS = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
+_PIXELS = {
+    "rgb": ("u", "uint8, from 0 to 255"),
+    "depth": ("fiu", "numbers, m"),
+    "segmentation": ("iu", "whole numbers"),
+}
 
 
 @checked
@@ -188,6 +194,11 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
             f"pos of the trajectory has shape {flight.pos.shape}; give (K, n, 3) of K times and n drones, or "
             "(W, K, n, 3) of W worlds"
         )
+    for name, width in _WIDTHS.items():
+        shape = (*flight.pos.shape[:-1], width)
+        if getattr(flight, name).shape != shape or not flight.pos.size:
+            given = f"{name} of the trajectory has shape {getattr(flight, name).shape}"
+            raise UserError(f"{given}; give {shape if flight.pos.size else 'at least one time, drone and world'}")
     if flight.pos.ndim == 4 and of_trajectory["images"] is not None:
         raise UserError("images are given beside many worlds; show one world, jax.tree.map(lambda x: x[0], trajectory)")
     if flight.pos.ndim == 3:
@@ -214,7 +225,8 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Fli
             "axis, for example by jaxdrones.repeat"
         )
     labels = of_trajectory["labels"]
-    labels = tuple(f"drone {i}" for i in range(n)) if labels is None else tuple(map(str, labels))
+    labels = [f"drone {i}" for i in range(n)] if labels is None else check_sequence("labels", labels, "'left'")
+    labels = tuple(map(str, labels))
     if len(labels) != n:
         raise UserError(f"labels are {len(labels)} names and there are {n} drones; give as many")
     targets = np.asarray(np.nan) if of_trajectory["targets"] is None else of_trajectory["targets"]
@@ -248,7 +260,11 @@ def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str,
     for name, frames in images.items():
         check_choice("kind of images", name, CHANNELS)
         shape = np.shape(frames)
-        if shape[:2] != (len(t), n) or len(shape) != (5 if CHANNELS[name] else 4):
-            axes = "(K, n, height, width" + (", channels)" if CHANNELS[name] else ")")
+        channels = shape[4:] in ((3,), (4,)) if CHANNELS[name] else shape[4:] == ()
+        if shape[:2] != (len(t), n) or len(shape) < 4 or not channels or 0 in shape:
+            axes = "(K, n, height, width" + (", 3 or 4)" if CHANNELS[name] else ")")
             raise UserError(f"images {name!r} have shape {shape}; give {axes} of {len(t)} times and {n} drones")
+        kind, (kinds, what) = np.asarray(frames).dtype, _PIXELS[name]
+        if kind.kind not in kinds or (name == "rgb" and kind != np.uint8):
+            raise UserError(f"images {name!r} are of type {kind}; give {what}")
     return {name: ImageSequence(t, np.asarray(frames)) for name, frames in images.items()}

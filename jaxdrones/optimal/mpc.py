@@ -68,7 +68,7 @@ class Mpc:
         self.message = "not called"
         """Message of the solver in its last call."""
         self._unit = float(model.params.hover_rpm)
-        self._reference = jax.jit(lambda setpoints: reference(model.params, setpoints, model.start.aux, dt))
+        self._reference = jax.jit(lambda params, setpoints: reference(params, setpoints, model.start.aux, dt))
         self._kept = _moving(model)
         self._scale = np.array([self._unit if name.startswith("rpm") else 1.0 for name in model.names])[self._kept]
         self._plan: np.ndarray | None
@@ -174,7 +174,7 @@ class Mpc:
     def _solved(self, state: State, setpoints: Setpoint, params: Params | None) -> np.ndarray | None:
         """Concatenated states and commands of the plan; `None` without convergence."""
         model = self.model
-        target = jax.device_get(self._reference(setpoints))
+        target = jax.device_get(self._reference(self._with_constants(params), setpoints))
         rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(self.horizon + 1)]
         targets = np.stack([model.vector(row.state) for row in rows])
         nominal = np.stack([row.rpm for row in rows[:-1]]) / self._unit
@@ -194,6 +194,14 @@ class Mpc:
         self.message = str(said["return_status"])
         plan = np.asarray(result["x"]).ravel()
         return plan if said["success"] and np.isfinite(plan).all() else None
+
+    def _with_constants(self, params: Params | None) -> Params:
+        """Parameters of the model with the given values of its symbolic constants."""
+        known = self.model.params
+        if params is None:
+            return known
+        names = dict.fromkeys(name.partition("[")[0] for name in self.model.parameter_names)
+        return known.replace(**{name: np.asarray(getattr(params, name), float) for name in names})
 
     def _guess(self, now: np.ndarray, targets: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Last plan, shifted by one interval; at first the reference."""

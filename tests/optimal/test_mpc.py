@@ -112,3 +112,16 @@ def test_the_figure_eight_of_five_seconds_is_tracked_within_three_centimeters(so
         assert mpc.status == Status.OK
         errors.append(np.linalg.norm(state.pos[0] - target(jnp.array([(k + 1) * DT])).pos[0]))
     assert np.sqrt(np.mean(np.square(errors[40:]))) < 0.03
+
+
+def test_the_reference_of_a_plan_is_that_of_the_given_constants():
+    """A drone 30 % heavier than the model hovers at its own speed, and was held 3 mm away from the target."""
+    from jaxdrones.optimal.mpc import Mpc
+
+    mpc = object.__new__(Mpc)
+    mpc.model = model(parameters=("mass",))
+    params = jd.load_params("cf2x")
+    heavy = params.replace(mass=1.3 * params.mass, kf=2 * params.kf)  # of which the mass alone is a symbol
+    expected = jd.load_params("cf2x").replace(mass=1.3 * params.mass).hover_rpm
+    np.testing.assert_allclose(mpc._with_constants(heavy).hover_rpm, expected, rtol=1e-6)
+    assert mpc._with_constants(None) is mpc.model.params

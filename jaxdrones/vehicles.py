@@ -104,6 +104,11 @@ def median(params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIES
     return _vehicle(params, mass, lambda name, median, low, high: jnp.clip(median, low, high))
 
 
+def largest_radius(heaviest: float) -> float:
+    """Largest collision radius of a random vehicle of up to a mass (kg), m."""
+    return LAWS["arm"].high * heaviest**ARM_POWER * (1 + LAWS["prop_radius"].high)
+
+
 def check_masses(lightest: float, heaviest: float) -> None:
     """Raise unless the scaling laws hold for these masses and the lightest is first."""
     for name, mass in ("lightest", lightest), ("heaviest", heaviest):

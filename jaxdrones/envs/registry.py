@@ -35,6 +35,7 @@ from jaxdrones.envs.randomize import (
     Noise,
     Randomization,
     all_randomizations,
+    check_starts,
     delay_bounds,
     nominal_params,
     sensor_noise,
@@ -149,6 +150,7 @@ def make(
     physics |= dict(dt=dt / substeps, substeps=substeps)
     scene = task.scene if scene is None else scene
     example = scene_example(scene)
+    check_starts(randomize, task, nominal, example)
     step: Step
     if backend == "bullet":
         from jaxdrones.engine import bullet  # needs an optional library

@@ -20,7 +20,7 @@ from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import curves, shaping
 from jaxdrones.tasks.curves import SHAPES
-from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.starts import check_apart, thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 
 HEIGHT = 2.0  # m, of the center of the curve
@@ -153,6 +153,8 @@ class _Carrying:
         here, places = self.target(variables, jnp.zeros((), dtype)), self.places(dtype)
         offset = jax.random.uniform(load_key, (loads, 3), dtype, -1, 1)
         if self.shared:
+            apart = 2 * self.length * math.sin(_TILT) * math.sin(math.pi / n)
+            check_apart(params, apart, "longer cables (length), or a smaller vehicle")
             beside = here.pos + 0.1 * offset
             state = thrown(start_key, params, beside + places, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
             carried = PointMass(beside, here.vel)

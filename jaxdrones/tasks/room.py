@@ -58,7 +58,8 @@ def room(
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on a ring in the room."""
-        check_apart(params, 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH)
+        apart = 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH
+        check_apart(params, apart, "a smaller vehicle or fewer drones")
         start_key, order_key = jax.random.split(key)
         places = jnp.asarray(ring, params.mass.dtype)
         state = thrown(start_key, params, places, reach=_REACH, speed=0.1, omega=0.1, tilt=0.1)

@@ -47,14 +47,14 @@ def above_ground(spread: Annotated[float, _SPREAD]) -> Callable[[jax.Array, Para
     return described(f"On a diagonal, 0.1 m above the ground{drawn}, with the rotors standing still.", start)
 
 
-def check_apart(params: Params, apart: float) -> None:
+def check_apart(params: Params, apart: float, remedy: str = "a smaller vehicle or a single drone") -> None:
     """Raise if drones of a known vehicle are wider than the smallest distance (m) between their starts."""
     if len(params.mass) > 1 and is_concrete(params.collision_radius):
         width = 2 * float(np.asarray(params.collision_radius).max())
         if width > apart:
             raise UserError(
                 f"drones of this vehicle are {width:.3g} m wide and would start in each other, as little as "
-                f"{apart:.3g} m apart; give a smaller vehicle or fewer drones"
+                f"{apart:.3g} m apart; give {remedy}"
             )
 
 

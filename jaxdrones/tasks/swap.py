@@ -33,7 +33,8 @@ def swap_goals(drones: Team = 8, duration: Seconds | None = None) -> Task:
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on a ring."""
-        check_apart(params, 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH)
+        apart = 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH
+        check_apart(params, apart, "a smaller vehicle or fewer drones")
         start_key, order_key = jax.random.split(key)
         angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
+from jaxdrones import vehicles
 from jaxdrones.envs import TASKS, AutoReset, make
 from jaxdrones.envs.disturbances import random_pushes
-from jaxdrones.envs.randomize import constant_wind, scaled, sensor_noise, shifted
+from jaxdrones.envs.randomize import AnyVehicle, constant_wind, scaled, sensor_noise, shifted
 from jaxdrones.learning import evaluate
 from jaxdrones.tasks.curves import circle
 from jaxdrones.tasks.hover import hover
@@ -194,3 +195,23 @@ def test_a_world_with_a_quaternion_that_is_no_attitude_is_refused():
     broken = world.replace(drones=world.drones.replace(quat=jnp.zeros((1, 4))))
     with pytest.raises(ValueError, match=r"state\.quat has length 0: .*give a unit quaternion"):
         env.step(KEY, broken, jnp.zeros((1, 4)))
+
+
+@pytest.mark.parametrize(("task", "remedy"), [("race", "a single drone"), ("swap-goals", "fewer drones")])
+def test_random_vehicles_that_would_start_in_each_other_are_refused(task, remedy):
+    """40 % of the races of vehicles of up to 3 kg began with drones in each other."""
+    with pytest.raises(ValueError, match=rf"with AnyVehicle\(heaviest=3\) drones .* 1\.23 m wide .* or {remedy}"):
+        make(task, realistic="any")
+    assert make(task, randomize=[AnyVehicle(heaviest=0.1)])
+
+
+def test_no_random_vehicle_is_larger_than_the_largest():
+    """Every parameter at the upper limit of its law."""
+    largest = vehicles._vehicle(CF2X, jnp.asarray(3.0), lambda name, median, low, high: high)
+    np.testing.assert_allclose(largest.collision_radius, vehicles.largest_radius(3.0), rtol=1e-6)
+
+
+def test_a_team_that_would_start_in_itself_above_a_load_is_refused():
+    with pytest.raises(ValueError, match=r"0\.76 m wide .* 0\.497 m apart; give longer cables"):
+        make("transport", vehicle="x500")
+    assert make("transport", vehicle="x500", length=0.8)

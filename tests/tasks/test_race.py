@@ -10,6 +10,7 @@ import pytest
 from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
+from jaxdrones.envs.randomize import AnyVehicle
 from jaxdrones.tasks import centerline
 from jaxdrones.tasks.race import _order
 from jaxdrones.tasks.racetrack import GATES, OPENING, direction, passes
@@ -92,7 +93,7 @@ def test_drones_of_different_vehicles_touch_at_the_sum_of_their_own_radii():
 
 @pytest.mark.slow
 def test_each_of_different_vehicles_starts_on_its_own_feet():
-    env = make("race", drones=3, realistic="any")
+    env = make("race", drones=3, randomize=[AnyVehicle(heaviest=0.1)])
     worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 20))[1]
     np.testing.assert_allclose(worlds.drones.pos[..., 2], jax.vmap(standing_height)(worlds.params), rtol=1e-12)
 

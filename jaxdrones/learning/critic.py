@@ -44,7 +44,7 @@ def critic_observation(
     privileged: PrivilegedObservation | None = None,
     action: Array | None = None,
 ) -> Obs:
-    """Observations of the critic, normalized.
+    """Observations of the critic, normalized; deviations of parameters beyond 1 by their logarithm.
 
     The hidden state (*batch, n, ...) is that after the observations, (*batch, n, d) or a dictionary with images. A
     privileged observation replaces the vector of the observations. The actions (*batch, n, a) of all drones are inputs
@@ -53,12 +53,18 @@ def critic_observation(
     vector = state_vector(obs) if privileged is None else privileged.obs
     x = policy.obs_stats.normalize(vector)
     if privileged is not None:
-        x = jnp.concatenate([x, privileged.params], axis=-1)
+        x = jnp.concatenate([x, _compressed(privileged.params)], axis=-1)
     if action is not None:
         x = centralized_input(x, action)
     states = [s.reshape(*x.shape[:-1], -1) for s in jax.tree.leaves(hidden_state)]
     x = jnp.concatenate([x, *states], axis=-1) if states else x
     return map_state_vector(lambda _: x, obs)
+
+
+def _compressed(deviation: Array) -> Array:
+    """Relative deviation up to 1, beyond it 1 plus its logarithm: the parameters of any vehicle reach 1,000."""
+    size = jnp.abs(deviation)
+    return jnp.where(size > 1, jnp.sign(deviation) * (1 + jnp.log(jnp.maximum(size, 1))), deviation)
 
 
 def centralized_input(

@@ -10,8 +10,10 @@ from double_integrator import SMALL, Clock, DoubleIntegrator, Point, PointWorld,
 from helpers import jit_unoptimized
 
 from jaxdrones import envs
+from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.envs.randomize import scaled
 from jaxdrones.learning import bptt, collect, ppo, shac
+from jaxdrones.learning.critic import critic_observation
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import RunningStatistics
@@ -299,3 +301,12 @@ def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
     mine, theirs = jax.grad(clipped)(policy.params), jax.grad(plain)(policy.params)
     for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_deviations_of_parameters_of_any_vehicle_are_within_the_reach_of_a_critic():
+    """They are up to 1,000 times the nominal ones, at which every unit of the network is saturated."""
+    policy = Policy.init(jax.random.key(0), DoubleIntegrator())
+    params = jnp.array([[0.5, -1.0, 1160.0, -1160.0, 0.0]])
+    found = critic_observation(policy, jnp.zeros((1, 2)), None, PrivilegedObservation(jnp.zeros((1, 2)), params))
+    large = 1 + np.log(1160)
+    np.testing.assert_allclose(found[0, 2:], [0.5, -1.0, large, -large, 0.0], rtol=1e-6)

@@ -192,7 +192,8 @@ def _fly(
     if isinstance(setpoint, Attitude):
         attitude = loops.degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):
-        memory, target = memory.replace(rpy=attitude), loops.degrees(setpoint.omega)
+        memory = memory.replace(rpy=attitude, attitude_integral=jnp.zeros_like(memory.attitude_integral))
+        target = loops.degrees(setpoint.omega)
     else:
         memory, target = loops.attitude_loop(gains, memory, state, attitude, dt)
     return _with_torque(gains, memory, state, attitude, thrust, target, dt)

@@ -283,3 +283,13 @@ def test_gains_of_a_vehicle_that_cannot_yaw_leave_yaw_out_and_without_gravity_th
     np.testing.assert_array_equal(without.rate_p, gains.rate_p * jnp.array([1, 1, 0]))
     with pytest.raises(ValueError, match=r"params.gravity is .*0.*; give a positive number \(m/s\^2\)"):
         controller.gains(params.replace(gravity=jnp.zeros(())))
+
+
+def test_an_attitude_that_was_followed_before_rates_is_not_integrated_after_them():
+    """As by the firmware, which resets the loop of attitudes while it follows rates."""
+    state, gains, thrust = one(hovering(team_of("cf2x"))), firmware_pid.gains(), jnp.asarray(30_000.0)
+    fly = jit_unoptimized(lambda memory, setpoint: firmware_pid.pwm(gains, memory, state, setpoint)[0])
+    memory = fly(firmware_pid.init(), firmware_pid.Attitude(rpy=jnp.full(3, 0.2), thrust=thrust))
+    assert np.all(np.abs(memory.attitude_integral) > 0.01)
+    memory = fly(memory, firmware_pid.Rates(omega=jnp.zeros(3), thrust=thrust))
+    np.testing.assert_array_equal(memory.attitude_integral, 0)

@@ -80,7 +80,7 @@ def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
         "charge": charge,
         "capacity": capacity,
         "design_capacity": capacity,
-        "percentage": charge / capacity,
+        "percentage": charge / capacity if capacity else unknown,
     }
     rounded: dict[str, Any] = {name: float(np.float32(value)) for name, value in readings.items()}  # as they arrive
     return msg.BatteryState(

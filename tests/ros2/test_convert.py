@@ -129,3 +129,9 @@ def test_a_message_that_cannot_be_flown_is_refused(name, message, says):
 def test_drones_and_their_topics_have_the_names_of_the_table():
     assert topics.output(2, "camera/image_raw").name == "drone_2/camera/image_raw"
     assert topics.command(0, "cmd_vel").type == msg.Twist.NAME
+
+
+def test_a_battery_without_a_capacity_has_no_known_percentage():
+    """It was a division by zero."""
+    state = convert._battery({"voltage": 4.0, "charge": 0.0, "capacity": 0.0}, msg.Header(convert.stamp(0), "base"))
+    assert math.isnan(state.percentage) and state.capacity == 0

@@ -21,6 +21,7 @@ from jaxdrones.firmware.betaflight.link import connect_msp
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.training.betaflight_pilot import PolicyPilot
 
 _RATE = whole("rate of the physics (Hz)", limit=8000)
@@ -106,15 +107,18 @@ def _run(options: argparse.Namespace) -> int:
         log = recorder.log(simulation.params, {"vehicle": options.vehicle, "controller": "betaflight"}, about)
         save_npz(log, file)
         settled = log.t > log.t[-1] - (flight.flown.armed_s - _TAKE_OFF)
-        if log.has("target_pos") and settled.any() and options.flip is None:
-            report |= {
-                "mean_error_m": float(log.error[settled].mean()),
-                "peak_error_m": float(log.error[settled].max()),
-            }
+        if options.flip is None:
+            report |= errors_of(log, settled)
         say(f"wrote {file}")
     report = {name: round(x, 4) if isinstance(x, float) else x for name, x in report.items()}
     print_results(options, report, listed(report))
     return print_error(*failed) if failed else 0
+
+
+def errors_of(log: FlightLog, rows: np.ndarray) -> dict[str, float]:
+    """Mean and largest distance from the target in those of the rows with a target, m; nothing without one."""
+    error = log.error[rows & np.isfinite(log.target_pos).all(axis=(1, 2))]
+    return {"mean_error_m": float(error.mean()), "peak_error_m": float(error.max())} if error.size else {}
 
 
 def _check(options: argparse.Namespace) -> None:

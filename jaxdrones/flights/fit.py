@@ -111,6 +111,7 @@ def fit(
         return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
     default = parameters.FROM_ROTOR_SPEEDS if kinds.pop() else parameters.FROM_PWM
     names = parameters.select_parameters(names) if named else default
+    parameters.check_guess(Vehicle.of(params), names)
     return _Problem(logs, params, names, motors).solve(validate, named, progress)
 
 

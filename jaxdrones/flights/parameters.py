@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxdrones.checks import check_whole, look_up
+from jaxdrones.errors import UserError
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 
@@ -83,6 +84,15 @@ def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
     selected = dict.fromkeys(each for name in names for each in look_up("parameter", name, known))
     check_whole("parameters", len(selected), limit=_MAX_PARAMETERS)
     return tuple(selected)
+
+
+def check_guess(vehicle: Vehicle, names: Sequence[str]) -> None:
+    """Raise for a positive parameter that is zero in the initial vehicle, and would stay so."""
+    zero = [name for name in names if PARAMETERS[name].scale is None and value_of(vehicle, name) == 0]
+    if zero:
+        raise UserError(
+            f"the vehicle has a {zero[0]} of 0, of which a fit finds a multiple; give a vehicle with a first guess"
+        )
 
 
 def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[ArrayLike]) -> Vehicle:

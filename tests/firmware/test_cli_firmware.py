@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 from documents import ROOT, blocks
 
+import jaxdrones as jd
 from jaxdrones.cli import _parser, main
+from jaxdrones.cli.betaflight import errors_of
 from jaxdrones.firmware.betaflight import Sticks
 from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import Joystick
 from jaxdrones.flights import read_log
+from jaxdrones.flights.log import FlightLog
 
 PAGE = ROOT / "docs" / "firmware.md"
 
@@ -150,3 +153,15 @@ def test_every_command_of_the_page_is_a_command():
     assert {arguments[0] for arguments in commands} >= {"betaflight", "crazyflie"}
     for arguments in commands:
         _parser().parse_args(arguments)
+
+
+def test_the_errors_of_a_flight_are_those_of_the_rows_with_a_target():
+    """Rows without a target made them NaN."""
+    rows = np.arange(4)
+    pos, none = np.zeros((4, 1, 3)), np.full((4, 1, 3), np.nan)
+    quat = np.tile([0.0, 0, 0, 1], (4, 1, 1))
+    target = np.stack([none[0], pos[0] + [3.0, 0, 0], none[0], pos[0] + [0, 1.0, 0]])
+    states = (pos, quat, pos, pos, np.zeros((4, 1, 4)))
+    log = FlightLog(0.1 * rows, *states, target_pos=target, params=jd.load_params("cf2x"))
+    assert errors_of(log, rows > 0) == {"mean_error_m": 2.0, "peak_error_m": 3.0}
+    assert errors_of(log, rows == 2) == {}

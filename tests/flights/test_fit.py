@@ -21,6 +21,7 @@ from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehi
 from jaxdrones.flights.fit import _estimate
 from jaxdrones.flights.least_squares import standard_errors
 from jaxdrones.flights.open_loop import _shifted, residuals
+from jaxdrones.flights.parameters import check_guess
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
 from jaxdrones.urdf import parse_params
@@ -248,3 +249,11 @@ def test_a_fitted_crazyflie_needs_the_thrust_of_the_real_one(capsys, tmp_path):
     (flight,), (nominal,) = results["closed_loop"], results["closed_loop_nominal"]
     assert abs(flight["pwm_sim"] / flight["pwm_real"] - 1) < 0.015
     assert flight["xy_rms_m"] < nominal["xy_rms_m"]
+
+
+def test_a_parameter_of_which_there_is_nothing_to_multiply_is_refused():
+    params = jaxdrones.load_params("cf2x")
+    check_guess(Vehicle.of(params), ["rotor_lag", "km", "drag_coeff_x"])
+    still = params.replace(rotor_rise_time=jnp.zeros(()), drag_coeff=jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"the vehicle has a rotor_lag of 0, .* with a first guess"):
+        check_guess(Vehicle.of(still), ["drag_coeff_x", "rotor_lag"])

@@ -72,7 +72,12 @@ def against(past: Policy, policy: Policy) -> collect.Act:
     """Actions of the first drones by a policy, of the others by past ones, each in an equal group of worlds."""
 
     def act(policy: Policy, past: Policy, noise: Any, hidden_state: Any, obs: collect.Obs) -> tuple[Any, Array, Any]:
-        count = len(jax.tree.leaves(past)[0])
+        count, worlds = len(jax.tree.leaves(past)[0]), len(state_vector(obs))
+        if worlds % count:
+            raise UserError(
+                f"each device has {worlds} worlds; give a number of worlds that is a multiple of past_policies, "
+                f"{count}, on every device"
+            )
 
         def of_others(x: Array) -> Array:
             return x[:, 1:].reshape(count, len(x) // count, *x[:, 1:].shape[1:])

@@ -86,9 +86,9 @@ class Trainer:
 
 
 def _devices(config: Any) -> list[jax.Device]:
-    """All devices of all hosts; on a single CPU, as many cores as can share worlds and minibatches equally."""
+    """All devices of all hosts; on a single CPU, as many cores as can share worlds and their groups equally."""
     devices = jax.devices()
     if devices[0].platform != "cpu" or jax.process_count() > 1:
         return devices
-    parts = config.worlds // getattr(config, "minibatches", 1)
+    parts = config.worlds // getattr(config, "minibatches", getattr(config, "past_policies", 1))
     return devices[: max(n for n in range(1, len(devices) + 1) if parts % n == 0)]

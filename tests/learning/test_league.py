@@ -1,6 +1,7 @@
 """The league: who flies whom, who learns, and when a policy is kept."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -64,3 +65,16 @@ def test_worlds_that_past_policies_cannot_share_are_a_mistake():
         league.Config(**SMALL | {"worlds": 5}, past_policies=2)
     with pytest.raises(ValueError, match="one policy for all drones"):
         league.Config(**SMALL, past_policies=2, per_agent=True)
+
+
+def test_every_device_has_worlds_for_every_past_policy(monkeypatch):
+    """Three worlds of each of four past policies have no equal halves."""
+    from jaxdrones.training import trainer
+
+    two = [types.SimpleNamespace(platform="cpu")] * 2
+    monkeypatch.setattr(trainer.jax, "devices", lambda: two)
+    assert len(trainer._devices(league.Config(worlds=12, past_policies=4))) == 1
+    assert len(trainer._devices(league.Config(worlds=16, past_policies=4))) == 2
+    past = {"kernel": jnp.zeros((4, 1))}
+    with pytest.raises(ValueError, match=r"each device has 6 worlds; give .* a multiple of past_policies, 4, on every"):
+        league.against(past, None)(None, None, jnp.zeros((6, 2, 3)))

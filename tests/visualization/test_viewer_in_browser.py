@@ -255,3 +255,12 @@ def test_drones_of_a_few_pixels_are_where_the_log_says(tmp_path):
         assert np.abs(drawn - pos[19, 7]).max() < 1.5 * reach
         np.testing.assert_allclose(drawn[:, :2].mean(axis=0), pos[19, 7, :2], atol=1e-3)
         assert tab.problems == []
+
+
+def test_the_curve_of_an_untrained_policy_is_a_point(record):
+    """The first evaluation of a training is at update 0, of which a share of the way was not a number."""
+    with Live(wait=0) as live, browser.open_tab() as tab:
+        live.show(record, "training", [(0, 0.25)])
+        tab.open(live.url)
+        assert tab.run("[...document.querySelectorAll('#curve circle')].map((x) => x.getAttribute('cx'))") == ["6"]
+        assert tab.problems == []

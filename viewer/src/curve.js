@@ -18,7 +18,7 @@ export function drawCurve(figure, curve, chosen) {
   const { label, points, best } = curve, share = label === "success", text = (y) => (share ? `${Math.round(100 * y)} %` : short(y));
   const values = points.map(([, y]) => y), [last, value] = points[points.length - 1];
   const low = share ? 0 : Math.min(...values), high = share ? 1 : Math.max(...values, low + 1e-6);
-  const place = ([x, y]) => [EDGE + ((WIDTH - 2 * EDGE) * x) / last, HEIGHT - EDGE - ((HEIGHT - 2 * EDGE) * (y - low)) / (high - low)];
+  const place = ([x, y]) => [EDGE + ((WIDTH - 2 * EDGE) * x) / (last || 1), HEIGHT - EDGE - ((HEIGHT - 2 * EDGE) * (y - low)) / (high - low)];
   const places = points.map(place), picture = element("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img" });
   picture.setAttribute("aria-label", `Learning curve: ${label} ${text(value)} after update ${last}`);
   for (const y of [low, high]) {

@@ -69,6 +69,7 @@ export class Simulation {
     this.pulled = null; // { plant, at }: by a pointer at these pixels
     this.last = performance.now();
     this.owed = 0;
+    this.flown = 0; // rows since the start of the plants
     player.playing = true;
     player.panel.set("trail", "3");
     this.controls();
@@ -145,6 +146,7 @@ export class Simulation {
 
   again() {
     for (const plant of this.plants) plant.reset();
+    this.flown = 0;
     this.restart();
   }
 
@@ -177,7 +179,8 @@ export class Simulation {
   fly(count) {
     const { plants, player } = this, rows = this.rows([]);
     for (let k = 1; k <= count; k++) {
-      for (const plant of plants) for (let i = 0; i < Math.round(1 / RATE / plant.dt); i++) plant.step();
+      const due = Math.round(++this.flown / RATE / plants[0].dt); // in all, as a row need not be a whole number of steps
+      for (const plant of plants) while (plant.steps < due) plant.step();
       rows.t.push(player.end + k / RATE);
       for (const [name, numbers] of Object.entries(this.rows(plants))) rows[name].push(...numbers);
     }

@@ -19,10 +19,12 @@ from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.status import is_finite
-from jaxdrones.vector import along_z, cross, dot, safe_sqrt
+from jaxdrones.vector import along_z, cross, dot, safe_sqrt, sin_cos, unit
 
 Horizon = Annotated[int, whole(minimum=2)]
 """Control steps of a plan; two have an angular acceleration of the reference."""
+
+_SMALL = 1e-3  # thrust over weight, or angle between thrust and heading, rad, below which an attitude is undefined
 
 
 class Weights(PyTreeNode):
@@ -105,9 +107,16 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
 
 
 def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> tuple[Array, Array]:
-    """Attitude and thrust (N) of an acceleration."""
+    """Attitude and thrust (N) of an acceleration.
+
+    The attitude of a free fall is level. That of a thrust along the heading is the limit from upright ones.
+    """
     force = params.mass * (acc + along_z(params.gravity))
-    axes = attitude.from_thrust(force, yaw)
+    sin, cos = sin_cos(yaw)
+    aside = cross(unit(force), jnp.stack([cos, sin, jnp.zeros_like(yaw)]))
+    least = _SMALL * params.mass * params.gravity
+    undefined = (dot(force, force) < least**2) | (dot(aside, aside) < _SMALL**2)
+    axes = attitude.from_thrust(force + along_z(jnp.where(undefined, least, 0)), yaw)
     return rotation.from_matrix(jnp.stack(axes, axis=-1)), safe_sqrt(dot(force, force))
 
 

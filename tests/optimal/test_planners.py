@@ -11,7 +11,7 @@ from closed_loop import distance, hovering, one, team_of
 from helpers import jit_unoptimized, mostly_slow
 
 import jaxdrones as jd
-from jaxdrones import optimal
+from jaxdrones import optimal, rotation
 from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.optimal import ilqr, lqr, mppi
@@ -328,3 +328,22 @@ def test_weights_that_have_no_best_command_are_refused(module):
         with pytest.raises(ValueError, match=said):
             module.settings(_step(), known.replace(**{name: value}))
     assert module.settings(_step(), known.replace(pos=jnp.zeros(3))).weights.pos[0] == 0
+
+
+def test_a_reference_in_free_fall_is_level_and_along_the_heading_it_is_the_limit():
+    """Without a direction of the thrust the attitude was one upside down, and planners turned the drone over."""
+    params, yaw = one(team_of("cf2x")), 0.5
+    ahead, fall = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([0, 0, -float(params.gravity)])
+    acc = jnp.asarray([fall, fall * (1 + 1e-9), fall + 5 * ahead, fall - 5 * ahead, fall + 5 * ahead + [0, 0, 0.02]])
+
+    def referred(acc):
+        rest = Setpoint.at(jnp.zeros((3, 3)))
+        found = optimal.reference(params, rest.replace(acc=jnp.tile(acc, (3, 1)), yaw=jnp.full(3, yaw)), {}, DT)
+        return rotation.axes(found.state.quat[0]), found.rpm
+
+    (x, y, z), rpm = jit_unoptimized(jax.vmap(referred))(acc)
+    left = [-ahead[1], ahead[0], 0]
+    np.testing.assert_allclose(rpm[:2], 0, atol=1)
+    np.testing.assert_allclose(z, [[0, 0, 1], [0, 0, 1], ahead, -ahead, ahead], atol=1e-2)
+    np.testing.assert_allclose(x, [ahead, ahead, [0, 0, -1], [0, 0, 1], [0, 0, -1]], atol=1e-2)
+    np.testing.assert_allclose(y, [left] * 5, atol=1e-2)

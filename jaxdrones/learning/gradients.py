@@ -57,8 +57,8 @@ class GradientConfig(Config):
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
     outlier_gradient: PositiveOrInfinite = _UNLIMITED
-    """Largest gradient of a world at a control step, relative to the median of all worlds. Longer ones are scaled down,
-    so that a few chaotic worlds do not dominate."""
+    """Largest gradient of a world at a control step, relative to the median of the worlds with a gradient. Longer ones
+    are scaled down, so that a few chaotic worlds do not dominate."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Switch = True
@@ -103,14 +103,19 @@ def scale_gradient(tree: Any, factor: Scalar) -> Any:
 
 @jax.custom_vjp
 def limit_gradient(worlds: Any, limit: Scalar) -> Any:
-    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds."""
+    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds.
+
+    Worlds whose gradient is zero, as after an episode, or not finite do not count.
+    """
     return worlds
 
 
 def _limited(limit: Scalar, cotangent: Any) -> tuple[Any, None]:
     leaves = [x for x in jax.tree.leaves(cotangent) if x.dtype != jax.dtypes.float0]
     length = jnp.sqrt(sum(jnp.sum(x**2, axis=tuple(range(1, x.ndim))) for x in leaves))
-    longest = limit * jnp.median(length)
+    counts = jnp.isfinite(length) & (length > 0)
+    ordered, count = jnp.sort(jnp.where(counts, length, jnp.inf)), jnp.sum(counts)
+    longest = limit * (ordered[jnp.maximum(count - 1, 0) // 2] + ordered[count // 2]) / 2
     scale = jnp.where(length > longest, longest / jnp.where(length > 0, length, 1), 1)
     scale = jnp.where(jnp.isfinite(length), scale, 0)
 

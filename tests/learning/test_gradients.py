@@ -160,3 +160,11 @@ def test_the_gradient_of_a_chaotic_world_is_shortened_to_a_multiple_of_the_media
     np.testing.assert_array_equal(gradient(jnp.zeros((5, 3)), 4.0), np.zeros((5, 3)))
     broken = gradient(slopes.at[3, 0].set(jnp.inf), 4.0)
     assert np.all(broken[3] == 0) and np.all(broken[:3] == slopes[:3])
+
+
+def test_worlds_without_a_gradient_do_not_count_for_the_limit_of_the_others():
+    """One world with NaN lifted the limit, and half of the worlds at their ends made it zero."""
+    slopes = jnp.array([[1, 1, 2, 100, jnp.nan], [0, 0, 0, 1, 100], [0, 0, 0, 0, 0], [jnp.inf, 0, 3, 0, 0]])
+    limited = jax.jit(jax.vmap(jax.grad(lambda x, slopes: jnp.sum(slopes * limit_gradient(x, 10.0))), (None, 0)))
+    expected = [[1, 1, 2, 15, 0], [0, 0, 0, 1, 100], [0, 0, 0, 0, 0], [0, 0, 3, 0, 0]]
+    np.testing.assert_allclose(limited(jnp.zeros(5), slopes), expected, rtol=1e-6)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdrones import writing
 from jaxdrones.arguments import checked, choice
-from jaxdrones.checks import short_repr
+from jaxdrones.checks import check_finite, short_repr
 from jaxdrones.envs import Env, explain
 from jaxdrones.errors import UserError
 from jaxdrones.export import c, js, onnx, stablehlo
@@ -62,7 +62,8 @@ def save(
         Result of each file, in the order of the drones.
 
     Raises:
-        ValueError: an unknown target, a policy that it cannot express, or a missing library.
+        ValueError: an unknown target, a policy that it cannot express, numbers that are not finite, or a missing
+            library.
         OSError: a file that cannot be written.
     """
     if not (name.isidentifier() and name.isascii() and name[0] != "_"):
@@ -72,6 +73,7 @@ def save(
             f"the policy is {short_repr(policy)}; give one of jaxdrones.learning (Policy), because the layers of a "
             "function are unknown, and `jax.export` saves any function"
         )
+    check_finite("policy", policy)
     explanation = explain(env)
     sizes = policy.obs_stats.mean.size, policy.network.output_size
     if sizes != (env.observation_size, env.action_size):

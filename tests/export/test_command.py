@@ -251,3 +251,11 @@ def test_the_targets_of_the_command_are_those_of_the_library():
     from jaxdrones.cli.export import TARGETS as NAMES
 
     assert TARGETS == NAMES
+
+
+def test_a_policy_with_numbers_that_are_not_finite_is_not_exported(tmp_path):
+    """Neither C nor JavaScript reads nanf."""
+    policy = jd.make_policy("hover")
+    lost = policy.replace(obs_stats=policy.obs_stats.replace(mean=policy.obs_stats.mean.at[3].set(jnp.nan)))
+    with pytest.raises(ValueError, match=r"policy.obs_stats.mean is not finite: .*; give finite numbers"):
+        save(lost, None, "c", tmp_path)

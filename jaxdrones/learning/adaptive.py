@@ -20,6 +20,7 @@ OBSERVED = ("position_error", "rotation_matrix", "velocity_error", "omega")
 OPTIONS = {"action": "throttle", "rotors": "lagging"}
 """Options of `jaxdrones.make` for an environment like those of its training."""
 _CORNERS = np.array([(1, -1), (-1, -1), (-1, 1), (1, 1)])  # front right, rear right, rear left, front left
+_SPINS = (-1, 1, -1, 1)
 _TURNS = (0.0, 90.0, 45.0, -45.0)  # degrees
 _CENTERED = 0.3  # of the largest coordinate of a rotor: below, it is on an axis
 
@@ -75,6 +76,7 @@ def _placed(name: str, params: Params) -> tuple[np.ndarray, tuple[int, ...]]:
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
         turned = places @ turn[:2, :2].T
         order = tuple(int(i) for i in np.argmax(_CORNERS @ turned.T, axis=1))
-        if np.abs(turned).min() > _CENTERED * np.abs(turned).max() and spin[order[0]] < 0:
+        at_corners = len(set(order)) == len(order) and np.abs(turned).min() > _CENTERED * np.abs(turned).max()
+        if at_corners and np.array_equal(np.sign(spin[list(order)]), _SPINS):
             return turn, order
     raise UserError(f"{name} needs four rotors at the corners of a cross, neighbors of opposite spins")

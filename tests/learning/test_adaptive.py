@@ -7,7 +7,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.learning import evaluate
+from jaxdrones.learning import adaptive, evaluate
 
 pytestmark = [pytest.mark.needs("foundation_policy"), pytest.mark.float32]
 KEY = jax.random.key(0)
@@ -103,3 +103,13 @@ def test_an_environment_that_raptor_cannot_fly_is_named():
             jd.make_policy("raptor", jd.make("hover", **options))
     with pytest.raises(ValueError, match="raptor"):
         jd.make_policy("eagle", jd.make("hover"))
+
+
+def test_neighbors_that_turn_the_same_way_are_refused():
+    """Only the spin of the front right rotor was compared."""
+    params = jd.load_params("cf2x")
+    for spin in ([-1.0, -1, 1, 1], [-1.0, 1, 1, -1]):
+        with pytest.raises(ValueError, match="neighbors of opposite spins"):
+            adaptive._placed("any-vehicle", params.replace(rotor_spin=np.array(spin)))
+    for vehicle in ("cf2x", "cf2p", "hb", "x500", "racer"):
+        assert sorted(adaptive._placed("any-vehicle", jd.load_params(vehicle))[1]) == [0, 1, 2, 3]

@@ -107,6 +107,11 @@ def mostly_slow(names: Iterable[str], quick: Sequence[str]) -> list:
     return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
+def mostly_slow_rows(rows: Iterable[tuple], quick: Sequence[tuple]) -> list:
+    """The same for rows of several parameters."""
+    return [row if row in quick else pytest.param(*row, marks=pytest.mark.slow) for row in rows]
+
+
 class Keys:
     """The random keys, as bytes, that were drawn from, of which others were made, and that were made."""
 

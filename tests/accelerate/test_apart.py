@@ -1,12 +1,13 @@
 """A function whose numbers are apart under `vmap` is what `vmap` computes, and so are all of its derivatives."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import flying, tape
+from helpers import flying, mostly_slow, mostly_slow_rows, tape
 
 import jaxdrones as jd
 from jaxdrones.accelerate.apart import apart_under_vmap
@@ -60,7 +61,7 @@ MANY = {
 }
 
 
-@pytest.mark.parametrize("name", MANY)
+@pytest.mark.parametrize("name", mostly_slow(MANY, ["one varies", "worlds of worlds, both", "one world"]))
 def test_results_are_those_of_vmap(name):
     many, arguments = MANY[name]
     same(jax.jit(many(apart_under_vmap(swung)))(*arguments), many(swung)(*arguments))
@@ -76,8 +77,11 @@ DERIVATIVES = {
 }
 
 
-@pytest.mark.parametrize("name", DERIVATIVES)
-@pytest.mark.parametrize("of", ["both vary", "one varies", "one world"])
+QUICK = [("grad", "both vary"), ("jacfwd", "one varies"), ("grad of grad", "one world")]
+EVERY = itertools.product(DERIVATIVES, ("both vary", "one varies", "one world"))
+
+
+@pytest.mark.parametrize(("name", "of"), mostly_slow_rows(EVERY, QUICK))
 def test_derivatives_are_those_of_vmap(name, of):
     """Also where a function has a rule of its own, which second derivatives follow in two ways."""
     many, arguments = MANY[of]

@@ -139,6 +139,7 @@ def test_large_teams_stay_whole():
     assert any(v.aval.size == 7 * 7 * 5 for eqn in loop.eqns for v in eqn.outvars)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("operations", "axes"), [(100, {1}), (3_000, {2})], ids=["short", "long"])
 def test_programs_too_long_to_compile_number_by_number_stay_whole(operations, axes):
     (loop,) = repeated(lambda x: functools.reduce(lambda y, _: y * x, range(operations), x), start)

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import mostly_slow
 
 from jaxdrones.accelerate.where_needed import where_needed
 
 X = jnp.arange(1.0, 65.0)
+each_derivative = pytest.mark.parametrize("derivative", mostly_slow([jax.grad, jax.jacfwd], [jax.grad]))
 
 
 def double(x, shared):
@@ -29,30 +31,30 @@ def test_what_is_needed_equals_vmap_and_the_rest_is_zero():
             np.testing.assert_array_equal(found[name], jnp.where(needed, expected[name], 0))
 
 
-def test_derivatives_are_those_of_the_function_where_it_is_needed_and_zero_elsewhere():
-    """Forward, backward and twice."""
+@each_derivative
+def test_derivatives_are_those_of_the_function_where_it_is_needed_and_zero_elsewhere(derivative):
+    """Once and twice."""
     cube = where_needed(lambda x: x**3, one_in=8)
-    for derivative in jax.grad, jax.jacfwd:
-        slope = derivative(lambda x, needed: cube(needed, x))
-        for f, expected in (slope, 3 * X**2), (derivative(slope), 6 * X):
-            of_worlds = jax.jit(jax.vmap(f))
-            for needed in (jnp.arange(64) < count for count in (0, 9, 64)):
-                np.testing.assert_allclose(of_worlds(X, needed), jnp.where(needed, expected, 0), rtol=1e-12)
+    slope = derivative(lambda x, needed: cube(needed, x))
+    for f, expected in (slope, 3 * X**2), (derivative(slope), 6 * X):
+        of_worlds = jax.jit(jax.vmap(f))
+        for needed in (np.arange(64) < count for count in (0, 9, 64)):
+            np.testing.assert_allclose(of_worlds(X, needed), np.where(needed, expected, 0), rtol=1e-12)
 
 
-def test_derivatives_elsewhere_are_those_of_the_given_value():
-    """Of one world with a number of Python and of many, forward, backward and twice."""
+@each_derivative
+def test_derivatives_elsewhere_are_those_of_the_given_value(derivative):
+    """Of one world with a number of Python and of many, once and twice."""
     cube = where_needed(lambda x: x**3, one_in=8)
 
     def chosen(x, needed):
         return cube(needed, x, otherwise=5 * x**2)
 
-    for derivative in jax.grad, jax.jacfwd:
-        slope = derivative(chosen)
-        assert (slope(2.0, True), slope(2.0, False)) == (12.0, 20.0)
-        for f, here, elsewhere in (slope, 3 * X**2, 10 * X), (derivative(slope), 6 * X, jnp.full(64, 10.0)):
-            found = jax.jit(jax.vmap(f))(X, X > 3)
-            np.testing.assert_allclose(found, jnp.where(X > 3, here, elsewhere), rtol=1e-12)
+    slope = derivative(chosen)
+    assert (slope(2.0, True), slope(2.0, False)) == (12.0, 20.0)
+    for f, here, elsewhere in (slope, 3 * X**2, 10 * X), (derivative(slope), 6 * X, np.full(64, 10.0)):
+        found = jax.jit(jax.vmap(f))(X, X > 3)
+        np.testing.assert_allclose(found, np.where(X > 3, here, elsewhere), rtol=1e-12)
 
 
 def test_a_given_value_may_be_all_that_is_differentiated():
@@ -60,6 +62,7 @@ def test_a_given_value_may_be_all_that_is_differentiated():
     np.testing.assert_allclose(jax.vmap(slope)(X, X > 3), jnp.where(X > 3, 0, 2 * X), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_worlds_with_one_key_get_one_result():
     key = jax.random.key(0)
     found = jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, key)
@@ -99,7 +102,10 @@ def due_only(due, before, *args):
     return where_needed(draw, chunk=CHUNK)(due, *args, otherwise=before)
 
 
-@pytest.mark.parametrize("axes", [(0, 0, 0, None, None), (None, 0, 0, None, None), (0, None, 0, None, None)])
+@pytest.mark.parametrize(
+    "axes",
+    mostly_slow([(0, 0, 0, None, None), (None, 0, 0, None, None), (0, None, 0, None, None)], [(0, 0, 0, None, None)]),
+)
 def test_images_and_their_gradients_are_those_of_a_choice(axes):
     args = [DUE, BEFORE, SIGNAL, GAIN, LABEL]
     args[:3] = (x if axis == 0 else jax.tree.map(lambda y: y[0], x) for x, axis in zip(args[:3], axes[:3], strict=True))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, flying, tape
+from helpers import assert_close, flying, mostly_slow, mostly_slow_rows, tape
 
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler, fitting, worlds
@@ -137,6 +137,7 @@ def test_a_controlled_flight_is_one_kernel():
     assert_close(in_chunks(held, 2)(starts), jax.jit(jax.vmap(held))(starts), 1e-10)
 
 
+@pytest.mark.slow
 def test_a_function_of_which_no_kernel_can_be_made_is_flown_by_many():
     def solved(start):
         return jnp.linalg.solve(jnp.eye(3) + start.pos.T @ start.pos, jnp.sort(start.vel).T)
@@ -145,7 +146,11 @@ def test_a_function_of_which_no_kernel_can_be_made_is_flown_by_many():
 
 
 @pytest.mark.parametrize(
-    ("numbers", "in_loop", "chunks"), [(0, True, True), (0, False, False), (3, True, False), (2_000, True, True)]
+    ("numbers", "in_loop", "chunks"),
+    mostly_slow_rows(
+        [(0, True, True), (0, False, False), (3, True, False), (2_000, True, True)],
+        [(0, True, True), (0, False, False)],
+    ),
 )
 def test_several_kernels_are_for_chunks_where_these_save_more_than_they_cost(numbers, in_loop, chunks):
     def sorted_speeds(start, key):
@@ -201,7 +206,7 @@ def lines(number, size):
 
 @pytest.mark.parametrize("inside_jit", [False, True], ids=["compiles itself", "inside jit"])
 @pytest.mark.parametrize("size", [3, 50], ids=["numbers apart", "whole"])
-@pytest.mark.parametrize("looped", [False, True], ids=["straight", "in a loop"])
+@pytest.mark.parametrize("looped", mostly_slow([False, True], [True]), ids=["straight", "in a loop"])
 def test_a_line_does_not_double_the_program(looped, size, inside_jit):
     function, x = lines(24, size)
     if looped:
@@ -228,9 +233,9 @@ def test_without_the_interfaces_that_it_needs_it_is_vmap_and_says_so_once(monkey
     worlds._warn_of_version.cache_clear()
     with pytest.warns(RuntimeWarning, match="over_worlds uses jax.vmap") as caught:
         for _ in range(2):
-            flown = jd.over_worlds(fly)(starts, commands)
+            doubled = jd.over_worlds(lambda x: 2 * x)(commands)
     assert len(caught) == 1
-    assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
+    np.testing.assert_array_equal(doubled, 2 * commands)
 
 
 @pytest.mark.slow
@@ -274,7 +279,7 @@ WITHIN = {
 
 
 @pytest.mark.parametrize("name", WITHIN)
-@pytest.mark.parametrize("looped", [False, True], ids=["straight", "in a loop"])
+@pytest.mark.parametrize("looped", mostly_slow([False, True], [False]), ids=["straight", "in a loop"])
 def test_within_a_transformation_it_is_what_vmap_is(name, looped):
     def along(vmap):
         repeated = (lambda g: lambda x: jax.lax.fori_loop(0, 2, lambda _, x: g(x), x)) if looped else lambda g: g
@@ -301,6 +306,7 @@ def test_the_same_function_may_be_called_with_arrays_and_within_a_transformation
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_kernel_that_does_not_compile_is_several_after_one_warning(monkeypatch):
     monkeypatch.setattr(fitting, "_ALLOWED", fitting._ALLOWED | {"sort"})  # calls a library
 

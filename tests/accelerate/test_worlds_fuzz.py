@@ -17,7 +17,7 @@ from jaxdrones.accelerate.fitting import fits_a_kernel
 from jaxdrones.accelerate.worlds import in_chunks
 
 TOLERANCES = {"float32": 1e-6, "float64": 1e-12}
-QUICK = 6
+QUICK = 3
 
 
 def assert_same(function, arguments, dtype, chunk, inside_jit, devices=()):

@@ -71,6 +71,7 @@ def test_a_weaker_battery_lifts_less():
     assert weak < 0.93 * strong
 
 
+@pytest.mark.slow
 def test_an_empty_battery_stops_the_rotors_and_gives_no_more():
     end = flown(TEAM, 5e4, 4800, charge=-28.0)
     assert np.all(end.rpm < 100)

@@ -55,6 +55,7 @@ def test_recorded_allocations_agree(name):
 
 
 @pytest.mark.float32
+@pytest.mark.slow
 @pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree_in_float32(name):
     case = golden_data.load(name)
@@ -257,6 +258,7 @@ def test_a_vehicle_whose_rotors_have_no_drag_ignores_the_demand_of_yaw():
     assert_finite(differentiate(params, params.weight, torque))
 
 
+@pytest.mark.slow
 def test_compiled_and_batched_allocations_equal_single_ones():
     params = jaxdrones.load_params("racer")
     thrust, torque = wild_wrenches(params, seed=4)

@@ -188,20 +188,24 @@ MODES = {
 @pytest.mark.parametrize("name", MODES)
 def test_modes_for_each_axis_give_what_the_set_points_of_all_axes_give(name):
     gains, tilted = firmware_pid.gains(), LEVEL.replace(quat=rotation.from_rpy(jnp.array([0.1, -0.2, 0.3])))
-    same = [firmware_pid.init()] * 2
-    for omega in jnp.array([[0.0, 0, 0], [0.3, -0.2, 0.1]]).repeat(4, axis=0):
-        steps = [
-            firmware_pid.pwm(gains, m, tilted.replace(omega=omega), s) for m, s in zip(same, MODES[name], strict=True)
-        ]
-        same = [memory for memory, _ in steps]
-        np.testing.assert_allclose(steps[0][1].pwm, steps[1][1].pwm)
+
+    def row(memories, omega):
+        state = tilted.replace(omega=omega)
+        steps = [firmware_pid.pwm(gains, memory, state, s) for memory, s in zip(memories, MODES[name], strict=True)]
+        return [memory for memory, _ in steps], [command.pwm for _, command in steps]
+
+    omegas = jnp.array([[0.0, 0, 0], [0.3, -0.2, 0.1]]).repeat(4, axis=0)
+    by_axis, of_all = jit_unoptimized(lambda: jax.lax.scan(row, [firmware_pid.init()] * 2, omegas)[1])()
+    np.testing.assert_allclose(by_axis, of_all)
 
 
 def test_a_mode_of_one_axis_leaves_the_others_alone():
     gains = firmware_pid.gains()
 
+    pwm = jit_unoptimized(firmware_pid.pwm)
+
     def command(**given):
-        return firmware_pid.pwm(gains, firmware_pid.init(), LEVEL, per_axis(**given))[1]
+        return pwm(gains, firmware_pid.init(), LEVEL, per_axis(**given))[1]
 
     mixed = command(by_pos=(False, False, True), pos=[5.0, 5, 1.2], vel=[0.4, -0.3, 5])  # as hover set-points are
     along, up = command(by_pos=(False,) * 3, vel=[0.4, -0.3, 0]), command(pos=[0.0, 0, 1.2])

@@ -50,6 +50,7 @@ def test_a_circle_is_tracked_as_well_as_it_is_described():
     assert worst["vel acc omega"] < worst["vel acc"] / 5 < worst["vel"] / 25 < worst[""] / 50
 
 
+@pytest.mark.slow
 def test_a_spin_is_followed_without_a_lag_if_its_rate_is_given():
     """1 rad/s about the vertical. Without the rate the heading lags by rate * damping / stiffness = 0.14 rad."""
     team = team_of(*VEHICLES)
@@ -77,6 +78,7 @@ def test_the_rotors_produce_the_wrench_of_lee(vehicle):
     free = np.asarray(jnp.all((share > 1e-3) & (share < 1 - 1e-3), axis=1))
     assert free.mean() > 0.5
 
+    wrenches = jit_unoptimized(jax.vmap(rotor_wrench))(team, state.replace(rpm=rpm))
     for i in np.flatnonzero(free):
         params, s, target = one(team, i), one(state, i), one(setpoint, i)
         k, inertia = geometric.gains(), np.diag(params.inertia)
@@ -93,7 +95,7 @@ def test_the_rotors_produce_the_wrench_of_lee(vehicle):
             + np.cross(s.omega, inertia @ s.omega)
             - inertia @ np.cross(s.omega, feed_forward)
         )
-        wrench = rotor_wrench(params, s.replace(rpm=rpm[i]))
+        wrench = jax.tree.map(lambda x, i=i: x[i], wrenches)
         np.testing.assert_allclose(wrench.force[2], params.mass * force @ r[:, 2], rtol=1e-12)
         np.testing.assert_allclose(wrench.torque, torque, rtol=0, atol=1e-12 * params.max_xy_torque)
 
@@ -121,6 +123,7 @@ def test_a_mirrored_drone_in_a_mirrored_world_turns_its_rotors_as_fast(vehicle):
     np.testing.assert_allclose(call(params, there, mirror_setpoint), call(team, state, setpoint), rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_rotor_is_asked_for_more_than_its_highest_speed():
     team = team_of(*VEHICLES)
     rpm = call(team, hovering(team), at(len(VEHICLES), (0, 0, 1000)))

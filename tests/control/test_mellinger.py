@@ -39,6 +39,7 @@ def placed():
     return flight(mellinger, VEHICLES, lambda t: target, 8, rotor_rise_time=0.041, rotor_fall_time=0.041)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i", range(len(VEHICLES)), ids=VEHICLES)
 def test_every_vehicle_comes_to_its_place_and_heading(placed, i):
     off = np.linalg.norm(np.asarray(placed.pos[:, i]) - [0.3, -0.2, 1.2], axis=-1)

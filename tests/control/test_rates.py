@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import always, at, fly, hovering, one, reaches, team_of
-from helpers import VEHICLES
+from helpers import VEHICLES, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -81,7 +81,7 @@ def test_every_vehicle_recovers_from_straight_upside_down():
     assert np.all(error[-1] < 0.01)
 
 
-@pytest.mark.parametrize("yaw", [-2.0, 0.5, 3.0])
+@pytest.mark.parametrize("yaw", mostly_slow([-2.0, 0.5, 3.0], [-2.0]))
 def test_the_yaw_of_a_setpoint_is_turned_to(yaw):
     team = team_of(*VEHICLES)
     targets = always(at(len(VEHICLES), (0, 0, 1), yaw=yaw), 6 * 240)
@@ -101,6 +101,10 @@ def test_the_inner_loop_compensates_the_gyroscopic_torque():
     params = params.replace(inertia=jnp.array([1.4e-5, 1.8e-5, 2.17e-5]))
     omega, commanded = jnp.array([6.0, -5.0, 2.0]), jnp.array([6.5, -5.5, 2.2])
     state = State(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), omega, jnp.zeros(4))
-    rpm = rates.follow(gains, params, state, params.gravity, commanded)
-    _, turning = newton_euler(params, state, rotor_wrench(params, state.replace(rpm=rpm)))
-    np.testing.assert_allclose(turning, gains.rate * (commanded - omega), rtol=1e-9)
+
+    @jax.jit
+    def turning():
+        rpm = rates.follow(gains, params, state, params.gravity, commanded)
+        return newton_euler(params, state, rotor_wrench(params, state.replace(rpm=rpm)))[1]
+
+    np.testing.assert_allclose(turning(), gains.rate * (commanded - omega), rtol=1e-9)

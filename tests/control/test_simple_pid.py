@@ -42,6 +42,7 @@ def test_at_48_hz_a_hummingbird_with_its_own_inertia_is_not_stable():
     assert np.max(fly_30_cm(48, seconds=10, max_rpm=np.inf)[-48:]) > 0.5  # measured: 0.9 m
 
 
+@pytest.mark.slow
 def test_the_first_call_kicks_and_the_second_does_not():
     """Derivatives are differences of errors, and the last error in a fresh memory is zero."""
     team = team_of("hb")

@@ -41,6 +41,7 @@ def test_the_speed_becomes_the_asked_share_of_the_limit(direction, share):
     np.testing.assert_allclose(flown.vel[-1], np.broadcast_to(expected, (2, 3)), rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_zero_stops_a_drone_and_keeps_its_heading():
     team = team_of("cf2x", "cf2p")
     start = hovering(team).replace(vel=jnp.broadcast_to(jnp.array([0.2, -0.1, 0.1]), (2, 3)))

@@ -189,6 +189,7 @@ def test_what_bullet_lets_touch_is_flagged():
     assert min(found.values()) > 20
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_a_drone_at_rest_on_either_ground_touches_it():
     params, state = team((0, 0, 0.03))

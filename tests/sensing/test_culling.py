@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized, mostly_slow
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
@@ -54,7 +54,8 @@ def hits(scene: Scene, state: State) -> jax.Array:
     return first.reshape(-1, *reversed(CAMERA.resolution))
 
 
-@pytest.mark.parametrize("worlds", mostly_slow([1, 3], [3]))
+@pytest.mark.slow
+@pytest.mark.parametrize("worlds", [1, 3])
 def test_among_two_thousand_trees_a_pixel_sees_the_nearest_of_all(worlds):
     """Worlds look in different directions, so the numbers of trees in view differ."""
     scene = trees(2000)

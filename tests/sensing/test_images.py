@@ -273,8 +273,8 @@ def test_the_sun_lights_the_ground_as_a_level_face():
     top = Scene.of(Box(pos=(0, 0, -1), size=(9, 9, 2)), ground=False).shapes(float)
     colors, far = jnp.array([shading._BRIGHT]), jnp.full_like(look_down.u + look_down.v, 1.0)
     index = far.astype(int) * 0
-    tiles = shade(look_down, [Ground.of(float)], colors, 0, index, far)
-    box = shade(look_down, top, colors, None, index, far)
+    tiles = jit_unoptimized(lambda: shade(look_down, [Ground.of(float)], colors, 0, index, far))()
+    box = jit_unoptimized(lambda: shade(look_down, top, colors, None, index, far))()
     np.testing.assert_array_equal(np.max(tiles, axis=(0, 1)), np.max(box, axis=(0, 1)))
 
 

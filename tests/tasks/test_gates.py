@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
+from jaxdrones import load_params
 from jaxdrones.envs import make
 from jaxdrones.sensing import Scene, track
 from jaxdrones.tasks.gates import FRAME, GATES, OPENING, POLES
 
-ENV = make("gates")
-RADIUS = float(ENV.params.collision_radius[0])
+ENV = functools.cache(lambda: make("gates"))
+RADIUS = float(load_params("cf2x").collision_radius)
 THROUGH, LEFT = np.array([0.1, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
-advance = jit_unoptimized(lambda world: ENV.task.advance(ENV.task, world))
-start_of_race = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
+advance = jit_unoptimized(lambda world: ENV().task.advance(ENV().task, world))
+start_of_race = functools.cache(lambda: jit_unoptimized(ENV().reset)(jax.random.key(0))[1])
 
 
 def moved(start, end, index=0, steps=0):
@@ -69,7 +70,7 @@ def test_after_the_last_gate_nothing_counts():
 def test_the_lap_time_runs_to_the_last_gate():
     there = jnp.array([5.0, 5.0, 1.0])
     racing, done = (moved(there, there, index, steps=120) for index in (0, len(GATES)))
-    np.testing.assert_allclose(racing["lap_time"], 120 * ENV.dt)
+    np.testing.assert_allclose(racing["lap_time"], 120 * ENV().dt)
     assert done["lap_time"].tolist() == start_of_race().variables["lap_time"].tolist() != racing["lap_time"].tolist()
 
 
@@ -119,7 +120,7 @@ def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_a
 
 def test_a_track_of_ones_own_is_flown_and_a_scene_without_gates_says_what_to_give():
     own = np.array([(0.0, 0.5 * i, 1.0, 0.3) for i in range(4)])
-    variables = make("gates", scene=track(own)).reset(jax.random.key(0))[1].variables
+    variables = jit_unoptimized(make("gates", scene=track(own)).reset)(jax.random.key(0))[1].variables
     np.testing.assert_allclose(variables["gates"], own, atol=1e-12)
     with pytest.raises(ValueError, match=r"whose first 16 boxes .* has 0 boxes; give one of jaxdrones.sensing.track"):
         make("gates", scene=Scene())

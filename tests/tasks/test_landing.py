@@ -1,5 +1,7 @@
 """Landing: how fast a drone touches down is what it falls with, and a hard touch is no success."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from jaxdrones import State, load_params, repeat
 from jaxdrones.envs import TASKS, make
 from jaxdrones.tasks import World
 
-ENV = make("landing")
+ENV = functools.cache(lambda: make("landing"))
 OFF = -jnp.ones((1, 4))
 RESTS = {"error": [0.0], "speed": [0.0], "upright": [1.0]}
 
@@ -18,7 +20,7 @@ RESTS = {"error": [0.0], "speed": [0.0], "upright": [1.0]}
 @pytest.mark.parametrize(("touch_speed", "landed"), [(0.3, True), (0.8, False)])
 def test_only_a_soft_touch_is_a_success(touch_speed, landed):
     metrics = {name: jnp.array([value]) for name, value in (RESTS | {"touch_speed": [touch_speed]}).items()}
-    assert ENV.task.success(metrics, ENV.dt).tolist() == [landed]
+    assert ENV().task.success(metrics, ENV().dt).tolist() == [landed]
 
 
 def flown(task, variables, heights, climbs=(0.0,) * 3):
@@ -35,9 +37,9 @@ def flown(task, variables, heights, climbs=(0.0,) * 3):
 def test_the_touch_speed_is_that_of_the_last_step_in_the_air_and_the_largest():
     """The step that comes within 2 cm of rest may already have been slowed by the ground."""
     start = {"goal": jnp.array([[0, 0, 0.01]]), "sinking": jnp.zeros(1), "touch_speed": jnp.zeros(1)}
-    _, after = flown(ENV.task, start, (0.06, 0.025, 0.01), (-1.0, -0.4, -0.1))
+    _, after = flown(ENV().task, start, (0.06, 0.025, 0.01), (-1.0, -0.4, -0.1))
     assert after["touch_speed"].tolist() == [1.0]
-    assert flown(ENV.task, start, (0.9, 0.8, 0.7), (-1.0, -2.0, -3.0))[1]["touch_speed"].tolist() == [0.0]
+    assert flown(ENV().task, start, (0.9, 0.8, 0.7), (-1.0, -2.0, -3.0))[1]["touch_speed"].tolist() == [0.0]
 
 
 def test_the_altitude_lost_is_down_to_the_lowest_point():
@@ -49,8 +51,8 @@ def test_the_altitude_lost_is_down_to_the_lowest_point():
 
 @pytest.mark.slow
 def test_a_drone_that_falls_touches_at_the_speed_of_its_fall():
-    height, step = 0.4, jit_unoptimized(ENV.step)
-    world = jit_unoptimized(ENV.reset)(jax.random.key(0))[1]
+    height, step = 0.4, jit_unoptimized(ENV().step)
+    world = jit_unoptimized(ENV().reset)(jax.random.key(0))[1]
     pad = world.variables["goal"]
     level = world.drones.replace(
         pos=pad.at[:, 2].add(height),

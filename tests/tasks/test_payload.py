@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized
+from helpers import jit_unoptimized, mostly_slow, mostly_slow_rows
 
 import jaxdrones as jd
 from jaxdrones.envs import make
@@ -20,11 +20,14 @@ def load_of(worlds):
     return worlds.drones.aux["payload"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task, drones",
     [
         ("sling", 1),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in [("sling", 2), ("transport", 2), ("transport", 4)]),
+        ("sling", 2),
+        ("transport", 2),
+        ("transport", 4),
     ],
 )
 def test_loads_start_near_the_curve_below_their_drones_on_cables_that_are_not_stretched(task, drones):
@@ -45,7 +48,9 @@ def test_loads_start_near_the_curve_below_their_drones_on_cables_that_are_not_st
         np.testing.assert_allclose(target.pos[:, 1, 1] - target.pos[:, 0, 1], 4.0, rtol=1e-5)
 
 
-@pytest.mark.parametrize("task, drones, mass", [("sling", 2, 0.5), ("transport", 4, 2.0)])
+@pytest.mark.parametrize(
+    "task, drones, mass", mostly_slow_rows([("sling", 2, 0.5), ("transport", 4, 2.0)], [("transport", 4, 2.0)])
+)
 def test_the_mass_of_a_load_is_the_share_of_its_drones(task, drones, mass):
     env = make(task, drones=drones, load=0.5, length=0.7)
     load = env.params.aux["payload"]
@@ -54,7 +59,8 @@ def test_the_mass_of_a_load_is_the_share_of_its_drones(task, drones, mass):
     np.testing.assert_allclose(load.stiffness * load.onset, 0.5 * env.params.mass * 9.8, rtol=1e-5)
 
 
-@pytest.mark.parametrize("task", ["sling", "transport"])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", mostly_slow(["sling", "transport"], ["sling"]))
 def test_a_load_is_the_same_whatever_the_random_mass_of_its_drones(task):
     env = make(task, load=0.5, realistic=True)
     params = jit_unoptimized(jax.vmap(lambda key: draw(env.draws, key, env.params)))(KEYS)
@@ -104,6 +110,7 @@ def test_success_is_an_rms_error_below_10_cm_and_a_largest_swing_below_15_degree
     assert make("sling", duration=1.0).task.success is None
 
 
+@pytest.mark.slow
 def test_a_load_weighs_on_the_drone_of_a_task_and_any_task_takes_one():
     """The action 0 is the weight of the drone alone: drone and load sink by the share of the load."""
     params = jd.with_payload(jd.load_params("cf2x"), 0.009)

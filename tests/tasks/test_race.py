@@ -17,8 +17,9 @@ from jaxdrones.tasks.racetrack import GATES, OPENING, direction, passes
 from jaxdrones.tasks.starts import standing_height
 
 START = np.array([-1.5, 0.75, 0.0, -0.2])
+centerline_of = jit_unoptimized(centerline.centerline)
 LINE = functools.cache(
-    lambda: centerline.centerline(jnp.asarray(np.tile(GATES, (2, 1))), jnp.asarray(START), jnp.asarray(12.0))
+    lambda: centerline_of(jnp.asarray(np.tile(GATES, (2, 1))), jnp.asarray(START), jnp.asarray(12.0))
 )
 ENV = functools.cache(lambda drones=2, **options: make("race", drones=drones, level=0, **options))
 RACING = jnp.ones(2, bool)
@@ -81,6 +82,7 @@ def test_drones_that_pass_through_each_other_between_two_control_steps_have_touc
         np.testing.assert_array_equal(after(left, right, active=[True, False])["touched"], [False] * 2)
 
 
+@pytest.mark.slow
 def test_drones_of_different_vehicles_touch_at_the_sum_of_their_own_radii():
     world = start()
     radius = jnp.array([1.0, 3.0]) * world.params.collision_radius
@@ -98,6 +100,7 @@ def test_each_of_different_vehicles_starts_on_its_own_feet():
     np.testing.assert_allclose(worlds.drones.pos[..., 2], jax.vmap(standing_height)(worlds.params), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_flight_along_the_centerline_makes_progress_of_its_length_and_back_none():
     line = LINE()
     way = np.asarray(line.pos[1]), np.asarray(line.pos[2])  # to the second gate, and to the third
@@ -123,7 +126,7 @@ def test_the_centerline_passes_the_gates_in_order_and_in_their_direction():
 def test_the_centerline_between_gates_on_a_circle_is_nearly_the_circle():
     angle = np.arange(4) * np.pi / 2
     gates = np.stack([np.cos(angle), np.sin(angle), np.ones(4), angle + np.pi / 2], axis=-1)
-    line = centerline.centerline(jnp.asarray(gates), jnp.asarray([0.0, -1, 1, 0]), jnp.asarray(4.0))
+    line = centerline_of(jnp.asarray(gates), jnp.asarray([0.0, -1, 1, 0]), jnp.asarray(4.0))
     np.testing.assert_allclose(np.linalg.norm(line.pos[..., :2], axis=-1), 1, atol=2e-3)
     np.testing.assert_allclose(line.along[3, 0], 1.5 * np.pi, rtol=5e-3)
     np.testing.assert_allclose(line.speed[2:], 2.0, rtol=0.03)  # v^2 / r is the largest acceleration
@@ -135,6 +138,7 @@ def test_speeds_of_the_centerline_begin_at_rest_and_keep_the_limit_of_the_accele
     assert np.all(np.abs(np.diff(square)) <= 2 * 12.0 * np.diff(along) * (1 + 1e-9))
 
 
+@pytest.mark.slow
 def test_without_contact_a_gate_counts_also_beside_its_opening_and_its_frame_ends_nothing():
     gate = GATES[0]
     left = np.array([-np.sin(gate[3]), np.cos(gate[3]), 0.0])

@@ -10,10 +10,9 @@ from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
 
-ENV = make("room", drones=3)
-TASK = ENV.task
-first_world = functools.cache(lambda: jit_unoptimized(ENV.reset)(jax.random.key(0))[1])
-advance = jit_unoptimized(lambda world: TASK.advance(TASK, world))
+ENV = functools.cache(lambda: make("room", drones=3))
+first_world = functools.cache(lambda: jit_unoptimized(ENV().reset)(jax.random.key(0))[1])
+advance = jit_unoptimized(lambda world: ENV().task.advance(ENV().task, world))
 
 
 def moved_to(*pos):
@@ -21,15 +20,20 @@ def moved_to(*pos):
     return advance(world.replace(drones=world.drones.replace(pos=jnp.asarray(pos))))
 
 
-@jit_unoptimized
-@jax.vmap
-def starts(key):
-    """Places on the ring, goals, and the smallest distance (m) of both from the obstacles of a room."""
-    scene_key, start_key = jax.random.split(key)
-    scene = TASK.scene(scene_key)
-    state, variables = TASK.begin(start_key, ENV.params, scene)
-    places = jnp.concatenate([state.pos, variables["goal"]])
-    return state.pos, variables["goal"], jnp.min(jax.vmap(scene.distance)(places))
+def starts(keys):
+    """Places on the ring, goals, and the smallest distance (m) of both from the obstacles of rooms."""
+    env = ENV()
+
+    @jit_unoptimized
+    @jax.vmap
+    def of_room(key):
+        scene_key, start_key = jax.random.split(key)
+        scene = env.task.scene(scene_key)
+        state, variables = env.task.begin(start_key, env.params, scene)
+        places = jnp.concatenate([state.pos, variables["goal"]])
+        return state.pos, variables["goal"], jnp.min(jax.vmap(scene.distance)(places))
+
+    return of_room(keys)
 
 
 @pytest.mark.slow
@@ -68,7 +72,7 @@ def test_drones_that_pass_through_each_other_between_two_control_steps_have_touc
 def test_success_is_arriving_within_20_cm_without_touching():
     errors = jnp.array([[1.0, 1.0, 1.0], [0.1, 0.3, 0.1]])  # time, drones
     touched = jnp.array([[0.0, 0, 0], [0, 0, 1]])
-    np.testing.assert_array_equal(TASK.success({"error": errors, "touched": touched}, 0.02), [True, False, False])
+    np.testing.assert_array_equal(ENV().task.success({"error": errors, "touched": touched}, 0.02), [True, False, False])
 
 
 def test_a_ring_has_room_for_so_many_drones():
@@ -77,6 +81,7 @@ def test_a_ring_has_room_for_so_many_drones():
         make("room", drones=13)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_terms_and_metrics_of_a_drone_that_flies_alone_are_one_number_for_it():
     env = make("room", drones=1)

@@ -47,6 +47,7 @@ def test_the_drones_fly_in_the_wakes_of_each_other_unless_told_otherwise():
     np.testing.assert_allclose(falls[0][1], falls[1][1], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_the_deviation_is_the_root_mean_square_after_the_first_second():
     """At 93 Hz, as 1 / (1 / 93) is a little less than 93."""

@@ -34,6 +34,7 @@ def make(**options):
     return jd.make("hover", rotors="lagging", action="throttle", **options)
 
 
+@pytest.mark.slow
 def test_raptor_commands_the_rotor_speeds_of_its_own_code():
     """On cf2x, whose rotor at the front right turns as in RAPTOR's training, and whose rotors have its order."""
     from foundation_policy import Raptor
@@ -48,6 +49,7 @@ def test_raptor_commands_the_rotor_speeds_of_its_own_code():
         np.testing.assert_allclose(speeds(env, action[0]), (last[0] + 1) / 2, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_raptor_flies_a_vehicle_with_other_axes_like_its_turned_twin():
     """Rotors on the axes, not at the corners: the same vehicle, turned by 45 degrees."""
     cross = jd.load_params("cf2x")
@@ -82,6 +84,7 @@ def test_the_policy_for_any_vehicle_hovers_drawn_ones_in_spite_of_delay_and_nois
     assert evaluate(env, jd.make_policy("any-vehicle", env), KEY, 200).success > 0.93
 
 
+@pytest.mark.slow
 def test_the_policy_for_any_vehicle_has_less_weights_than_raptor_and_is_not_told_the_vehicle():
     """The same observations give the same throttle, whatever the mass and the largest speed of the vehicle."""
     weights = jd.make_policy("any-vehicle", make()).network.params

@@ -35,7 +35,8 @@ def test_the_table_has_the_success_of_every_policy():
         assert f"| {100 * success:.1f} % | {low} | {report['evaluation']['episodes']} |" in table
 
 
-@pytest.mark.parametrize("task", ["hover", "recovery", *(pytest.param(x, marks=pytest.mark.slow) for x in BUNDLED)])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", BUNDLED)
 def test_a_policy_succeeds_as_often_as_its_report_says(task):
     """On other starts than those of the report: within four standard deviations of a sample of 200."""
     expected = report_of(task)["evaluation"]["success"]

@@ -22,6 +22,7 @@ def rising(key, params, progress):
     return state.replace(pos=pos), variables
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_the_start_of_a_task_sees_the_progress_of_training_without_another_compilation():
     env = jd.make(dataclasses.replace(HOVER, start=rising, duration=0.02))  # an episode of two steps

@@ -150,6 +150,7 @@ def test_an_episode_with_a_position_that_is_not_finite_is_no_success():
     assert flown(0.1, env=env).success == 1 and flown(jnp.nan, env=env).success == 0
 
 
+@pytest.mark.slow
 def test_an_episode_of_a_team_succeeds_when_all_of_it_does():
     team = lift(drones=2)
     assert flown([0, 0], env=team).success == 1 and flown([0, -1], env=team).success == 0
@@ -160,7 +161,11 @@ def test_an_episode_of_a_team_succeeds_when_all_of_it_does():
     [
         pytest.param({}, lambda n: 1, marks=pytest.mark.slow),  # what is drawn has no effect
         (dict(starts=(0.0, 0.01, 0.02, 0.03)), lambda n: 4),
-        (dict(noise=lambda key, state: state.replace(pos=state.pos + jax.random.uniform(key, (1, 3)))), lambda n: n),
+        pytest.param(
+            dict(noise=lambda key, state: state.replace(pos=state.pos + jax.random.uniform(key, (1, 3)))),
+            lambda n: n,
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["one start", "four starts", "noise"],
 )

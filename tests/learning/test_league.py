@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.learning import bptt, league
@@ -23,13 +23,14 @@ def scaled(policy, factor):
 
 def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_policies_of_their_worlds():
     env = jd.make("hover", drones=3)
-    policy = league.init(KEY, env, CONFIG).policy
+    policy = jit_unoptimized(lambda: league.init(KEY, env, CONFIG).policy)()
     past = jax.tree.map(lambda *x: jnp.stack(x), scaled(policy, 2.0), scaled(policy, -3.0))
     obs = jax.random.normal(KEY, (4, 3, env.observation_size))
-    _, action, _ = league.against(past, policy)(None, None, obs)
-    np.testing.assert_allclose(action[:, 0], policy(obs)[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(action[:2, 1:], scaled(policy, 2.0)(obs)[:2, 1:], rtol=1e-6)
-    np.testing.assert_allclose(action[2:, 1:], scaled(policy, -3.0)(obs)[2:, 1:], rtol=1e-6)
+    _, action, _ = jit_unoptimized(lambda obs: league.against(past, policy)(None, None, obs))(obs)
+    act = jit_unoptimized(lambda policy: policy(obs))
+    np.testing.assert_allclose(action[:, 0], act(policy)[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(action[:2, 1:], act(scaled(policy, 2.0))[:2, 1:], rtol=1e-6)
+    np.testing.assert_allclose(action[2:, 1:], act(scaled(policy, -3.0))[2:, 1:], rtol=1e-6)
 
 
 @pytest.mark.slow

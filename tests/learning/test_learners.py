@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from double_integrator import SMALL, Clock, DoubleIntegrator, Point, PointWorld, dynamics
-from helpers import jit_unoptimized
+from helpers import jit_unoptimized, mostly_slow
 
 from jaxdrones import envs
 from jaxdrones.envs.observations import PrivilegedObservation
@@ -104,7 +104,7 @@ def test_learning_rates_can_be_mapped():
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("reset", [True, False])
+@pytest.mark.parametrize("reset", mostly_slow([True, False], [True]))
 def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_one_could_end(reset):
     """Half of the episodes fail after one step, the others last for 10, unless they are cut."""
     env, horizon, fraction = Clock(steps=10, drones=2), 4, 0.3
@@ -127,7 +127,7 @@ def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_on
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("learner", [bptt, shac], ids=["bptt", "shac"])
+@pytest.mark.parametrize("learner", mostly_slow([bptt, shac], [bptt]), ids=["bptt", "shac"])
 def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learner):
     """An episode observes 0, 1, 2; where nothing is reset, five more steps of the trajectory observe 3."""
     env = Clock(steps=3)
@@ -142,7 +142,7 @@ def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learn
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("ends", ["truncated", "terminated"])
+@pytest.mark.parametrize("ends", mostly_slow(["truncated", "terminated"], ["truncated"]))
 def test_an_episode_that_ends_inside_a_trajectory_of_shac_is_worth_the_same_as_one_that_ends_with_it(ends):
     """Without rewards the gradient is that of the terminal value, which a time limit and a cut have."""
 

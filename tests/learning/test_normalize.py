@@ -28,15 +28,16 @@ def test_what_was_seen_first_can_be_forgotten():
 
 def test_normal_observations_have_zero_mean_and_unit_variance_and_outliers_are_cut():
     x = jnp.asarray(np.random.default_rng(0).normal(3.0, 2.0, size=(500, 4)))
-    normal = RunningStatistics.of(x).normalize(x)
-    np.testing.assert_allclose(jnp.mean(normal, 0), 0, atol=1e-12)
-    np.testing.assert_allclose(jnp.var(normal, 0), 1, rtol=1e-12)
-    assert jnp.max(RunningStatistics.of(x).normalize(x + 1e6)) == 10
+    normalized = jax.jit(lambda y: RunningStatistics.of(x).normalize(y))
+    normal = np.asarray(normalized(x))
+    np.testing.assert_allclose(np.mean(normal, 0), 0, atol=1e-12)
+    np.testing.assert_allclose(np.var(normal, 0), 1, rtol=1e-12)
+    assert np.max(normalized(x + 1e6)) == 10
 
 
 def test_an_entry_that_never_changes_stays_finite():
-    constant = jnp.ones((10, 2))
-    assert jnp.all(RunningStatistics.of(constant).normalize(constant) == 0)
+    constant = jnp.ones((8, 2))
+    assert not np.any(jax.jit(lambda x: RunningStatistics.of(x).normalize(x))(constant))
 
 
 def test_vectors_that_do_not_count_change_nothing():

@@ -54,6 +54,7 @@ def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_r
     assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)
 
 
+@pytest.mark.slow
 def test_a_healthy_training_runs_where_jax_finds_nan_and_has_no_return_before_an_episode_ended():
     seen = []
     with jax.debug_nans(True):
@@ -87,9 +88,11 @@ def test_the_learning_rate_is_no_cause_of_gradients_that_never_were_finite(befor
 
 def test_a_gradient_that_is_not_finite_is_replaced_by_zero_and_counted():
     transformation = clip_gradient(1.0)
-    for bad in (jnp.nan, jnp.inf, 1e30):
-        clipped, _ = transformation.update({"a": jnp.array([1.0, bad]), "b": jnp.array(2.0)}, None)
-        assert all(jnp.all(x == 0) for x in jax.tree.leaves(clipped))
+    clip = jax.jit(
+        lambda bad: transformation.update({"a": jnp.array([1.0, 0]).at[1].set(bad), "b": 2.0 + 0 * bad}, None)[0]
+    )
+    for bad in (np.nan, np.inf, 1e30):
+        assert not any(np.any(x) for x in jax.tree.leaves(clip(bad)))
     np.testing.assert_array_equal(count_nonfinite(jnp.array([[1.0, jnp.nan], [jnp.inf, 0.0]])), 2)
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import mostly_slow_rows
 
 from jaxdrones import envs
 from jaxdrones.learning import bptt, ppo, shac
@@ -100,7 +101,10 @@ def test_every_preset_makes_sense(task, algorithm):
         Recipe.of(task, algorithm, realistic)
 
 
-@pytest.mark.parametrize("task, options", [("crowd", {"obstacles": 1.0}), ("race", {"contact": True})])
+@pytest.mark.parametrize(
+    "task, options",
+    mostly_slow_rows([("crowd", {"obstacles": 1.0}), ("race", {"contact": True})], [("race", {"contact": True})]),
+)
 def test_contact_can_be_trained(task, options):
     """Two physics steps in a control step, as in training without contact, are too few: contact would be unstable."""
     practice, _ = presets.preset(task, "bptt", practice=True, **options)

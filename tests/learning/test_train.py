@@ -55,6 +55,7 @@ class Remember(nn.Module):
 OWN = {"nnx": NnxNetwork, "equinox": equinox_network}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", mostly_slow(OWN, ["equinox"]))
 def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
     """The gradient of a flight of the double integrator, of the same weights; that of flax linen is the reference."""
@@ -115,6 +116,7 @@ def test_a_network_that_does_not_fit_is_refused(network, error):
         bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], network=network)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @EACH_LEARNER
 def test_a_training_continued_from_a_state_is_one_long_training_and_the_callback_sees_every_update(learner):

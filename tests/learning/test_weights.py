@@ -1,5 +1,6 @@
 """Policies from the weights of other libraries."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -24,5 +25,5 @@ def test_the_policy_is_the_multilayer_perceptron_of_the_weights(per_agent):
     policy = mlp_policy(
         [(w.astype(np.float32), b.astype(np.float32)) for w, b in layers], activation="relu", per_agent=per_agent
     )
-    np.testing.assert_allclose(policy(obs.astype(np.float32)), x, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(lambda obs: policy(obs))(obs.astype(np.float32)), x, atol=1e-5)
     assert policy.per_agent == per_agent and policy.network.hidden_sizes == (5, 4)

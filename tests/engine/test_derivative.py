@@ -85,6 +85,7 @@ def test_an_integrator_moves_a_further_field_by_its_rate(integrator):
     np.testing.assert_allclose(after.label, 0.5, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_the_aux_of_no_model_stays_and_effects_read_it():
     def fan(params, state):
         return jd.Wrench.of_force(jd.vector.along_z(state.aux["fan"]["force"]))

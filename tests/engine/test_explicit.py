@@ -158,6 +158,7 @@ def test_vmap_over_worlds_equals_a_loop():
         assert_close(jax.tree.map(lambda x, i=i: x[i], together), full_step(team, world, command[i]), ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_vmap_over_vehicles_equals_a_loop():
     teams = [jaxdrones.repeat(jaxdrones.load_params(vehicle), 1) for vehicle in VEHICLES]
     start, command = flying(teams[0]), tape(teams[0], 1)[0]
@@ -202,7 +203,8 @@ def test_a_lower_drone_leaves_the_upper_one_alone():
     np.testing.assert_allclose(end.pos[-1, 1], start.pos[1], atol=ROUND_OFF)
 
 
-@pytest.mark.parametrize("pair", mostly_slow([downwash, downwash_2021], [downwash]), ids=name_of)
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", [downwash, downwash_2021], ids=name_of)
 def test_a_drone_is_not_its_own_neighbour(pair):
     team = jaxdrones.repeat(cf2x, 1)
     start, command = flying(team), tape(team, 1)[0]

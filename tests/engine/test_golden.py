@@ -47,6 +47,7 @@ def test_single_steps_of_the_paper_agree_in_velocity_and_body_rates(name):
 
 
 @pytest.mark.float32
+@pytest.mark.slow
 @pytest.mark.parametrize("name", golden_data.names("pos_in", physics="dyn", variant="main"))
 def test_single_steps_agree_in_float32(name):
     case = golden_data.load(name)

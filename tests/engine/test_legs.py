@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.engine.rollout import leg_length, legs
 
 
-@pytest.mark.parametrize("leg", mostly_slow([1, 4, 10, 16], quick=[4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("leg", [1, 4, 10, 16])
 def test_legs_are_the_rollout_cut_into_pieces(leg):
     params = jd.repeat(jd.load_params("cf2x"), 2)
     start = jd.State.at_rest(jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.5]]))

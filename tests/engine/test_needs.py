@@ -211,6 +211,7 @@ def test_rotors_by_pwm_have_the_same_lag():
         step(racer, START, STILL)
 
 
+@pytest.mark.slow
 def test_random_lags_that_are_too_short_for_the_step_are_refused():
     options = dict(vehicle="racer", rotors="lagging", control_hz=50, substeps=1)
     jd.make("hover", randomize=(scaled("rotor_rise_time", 0.6, 1.5),), **options)

@@ -77,6 +77,7 @@ def test_gradients_are_those_of_all_pairs():
     assert np.max(np.abs(by_cells.pos)) > 1e-6
 
 
+@pytest.mark.slow
 def test_a_drone_that_is_lost_does_not_change_the_others():
     """Whose position is not a number or infinite, compared with one 10,000 km away."""
     params, state = team(8.0)

@@ -68,6 +68,7 @@ def test_memory_may_be_any_pytree():
     np.testing.assert_array_equal(trajectory.rpm[:, 0, 0], [0, 100, 200, 300])
 
 
+@pytest.mark.slow
 def test_rollouts_of_many_worlds_come_from_vmap():
     worlds = jax.tree.map(lambda x: jnp.stack([x, 0.9 * x]), start)
     worlds = worlds.replace(quat=jnp.stack([start.quat, start.quat[::-1]]))

@@ -19,7 +19,7 @@ def test_every_task_keeps_the_contract_on_bullet(task):
 
 
 @pytest.mark.needs("pybullet")
-@pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals", "hover-2x"], ["hover"]))
+@pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals", "hover-2x"], []))
 def test_in_free_flight_both_backends_see_and_reward_the_same(task):
     options = dict(effects=("drag",), pairs=("downwash",))
     explicit = make(task, **options)

@@ -41,6 +41,7 @@ def test_an_environment_is_immutable():
     assert hash(env) == hash(env) and env != dataclasses.replace(env, steps=3)
 
 
+@pytest.mark.slow
 def test_replacing_a_field_keeps_what_is_drawn():
     env = make("hover", delay=(0.0, 0.04), disturbance=jd.dryden(7.7))
     other = dataclasses.replace(env, steps=3)

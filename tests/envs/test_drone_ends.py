@@ -120,6 +120,7 @@ def test_who_flies_on_after_the_time_limit_can_still_fail(ends):
     assert [bool(x[3]) for x in answers] == [False] * (STEPS - 1) + [True] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.slow)])
 def test_a_drone_that_left_acts_on_no_other(backend):
     """The upper drone ends in the first step; from the next one on the lower one flies as if it were alone."""
@@ -170,6 +171,7 @@ def collected(env, horizon=STEPS, starts=False):
     return jit_unoptimized(trajectory)(worlds)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_rewards_and_statistics_of_learners_are_those_of_the_drones_that_fly():
     trajectory = collected(column())
@@ -213,6 +215,7 @@ def test_every_learner_learns_in_a_team_whose_drones_end_alone(learner):
     assert np.all(np.isfinite(result.history["reward"])) and np.all(result.history["nonfinite_gradients"] == 0)
 
 
+@pytest.mark.slow
 def test_success_and_ends_are_counted_by_drone():
     report = evaluate(column(), Fixed(jnp.array([-1.0, 0.0])), KEY, 3)
     assert report.success == 0.5 and report.end_rates == {"fell": 0.5, "rose": 0}
@@ -237,6 +240,7 @@ def test_drones_of_an_episode_are_as_many_trials_as_they_are_independent():
     np.testing.assert_allclose(_interval(np.ones((200, 8), bool), 200), wilson_interval(200, 200))
 
 
+@pytest.mark.slow
 def test_the_log_of_an_episode_holds_the_last_state_of_a_drone_that_left():
     env = column()
     log = fly_episode(env, Fixed(jnp.array([-1.0, 0.0])), KEY)

@@ -1,12 +1,13 @@
 """Observation terms against what they stand for."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized
+from helpers import jit_unoptimized, mostly_slow_rows
 from scipy.spatial.transform import Rotation
 
 import jaxdrones as jd
@@ -37,8 +38,13 @@ def test_a_privileged_critic_is_given_relative_deviations_of_what_is_drawn():
     np.testing.assert_allclose(deviations(drawn, TEAM, chosen), [[0.1], [-0.2]], rtol=1e-9)
 
 
-@pytest.mark.parametrize("dtype", [jnp.uint8, jnp.int8, jnp.int32])
-@pytest.mark.parametrize("bound", [10.0, 1000.0, np.inf])
+@pytest.mark.parametrize(
+    ("bound", "dtype"),
+    mostly_slow_rows(
+        list(itertools.product((10.0, 1000.0, np.inf), (jnp.uint8, jnp.int8, jnp.int32))),
+        [(10.0, jnp.uint8), (np.inf, jnp.int32)],
+    ),
+)
 def test_a_term_of_whole_numbers_is_clipped_as_the_same_real_numbers_are(dtype, bound):
     task = TASKS["hover"]()
     values = jnp.arange(0, 120, 40).astype(dtype)[None]

@@ -155,11 +155,13 @@ def test_pushes_are_added_to_the_force_at_the_start():
     disturbance, force = random_pushes(0.5, interval=0.1, duration=0.05), jnp.array([0.05, 0.0, -0.01])
     team = TEAM.replace(external_force=jnp.broadcast_to(force, TEAM.external_force.shape))
     team = jax.vmap(disturbance.start)(jax.random.split(KEY, len(team.mass)), team)
-    found = []
-    for key in jax.random.split(KEY, 200):
+
+    def push(team, key):
         team = disturbance(key, team, 0.01)
-        found.append(np.asarray(team.external_force - force[None]))
-    calm = np.all(np.array(found) == 0, axis=-1)
+        return team, team.external_force - force[None]
+
+    found = jax.jit(lambda team: jax.lax.scan(push, team, jax.random.split(KEY, 200))[1])(team)
+    calm = np.all(found == 0, axis=-1)
     assert 0.3 < calm.mean() < 0.9 and not np.allclose(found, 0)
 
 

@@ -87,8 +87,6 @@ EPISODES = mostly_slow(
     quick=[
         "rl_main_HoverAviary_pid_121",
         "rl_paper_HoverAviary_one_d_pid_11",
-        "rl_paper_LeaderFollowerAviary_one_d_rpm_11",
-        "rl_paper_TuneAviary_tun_11",
     ],
 )
 

@@ -74,6 +74,7 @@ def test_a_drawn_scene_is_another_one_in_every_episode_and_the_same_within():
     np.testing.assert_allclose(obs[:, 0, 0], away, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_start_may_depend_on_the_scene():
     """Above the ball, wherever that is."""
     plain = TASKS["hover"]()

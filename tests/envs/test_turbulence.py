@@ -92,6 +92,7 @@ def test_an_episode_starts_within_the_turbulence():
     np.testing.assert_allclose(wind.std(axis=0), [scales(10.0, 30.0)[axis][1] for axis in AXES], rtol=0.034)
 
 
+@pytest.mark.slow
 def test_a_step_of_any_length_keeps_the_intensity():
     """From the stationary state; 3.3 % is three standard deviations."""
     turbulence = jd.dryden(10.0, 30.0)

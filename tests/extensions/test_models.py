@@ -155,6 +155,7 @@ def test_a_payload_on_cables_without_damping_keeps_energy_to_the_order_of_the_in
     assert np.log2(drift(dt) / drift(dt / 2)) > order - 0.4
 
 
+@pytest.mark.slow
 @each_integrator
 def test_a_payload_keeps_the_momentum_of_team_and_load_to_rounding(integrator):
     team = TEAM.replace(gravity=jnp.zeros(2))

@@ -44,6 +44,7 @@ def test_a_colored_box_in_front_is_seen_where_geometry_says():
     assert red > 100 and green < 20 and blue < 20
 
 
+@pytest.mark.slow
 def test_the_camera_turns_with_the_drone():
     ball = Sphere(pos=(0.0, 2.0, 1.0), radius=0.3)
     with bullet.make_step(scene=Scene.of(ball)) as step:

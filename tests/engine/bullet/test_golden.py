@@ -140,6 +140,7 @@ def test_a_fall_ends_at_the_recorded_height_and_gains_no_energy(name):
     assert upright.all() and np.all(np.abs(state.pos[:, 2] - rest) < 2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     golden_data.names(
@@ -182,6 +183,7 @@ def test_drones_that_meet_rebound_by_no_more_than_a_third_of_their_speed(name):
     assert nearest > case.constants["collision_h"] - path_of_a_step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aside", [0.0, 0.03, 0.06, 0.1])
 def test_drones_that_meet_off_centre_part_slowly_whenever_in_a_step_they_touch(aside):
     params, step = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 2), step_of("pyb")

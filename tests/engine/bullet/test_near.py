@@ -36,10 +36,13 @@ def flight(step, pos, vel):
 @pytest.mark.parametrize(
     ("solids", "pos", "vel", "touched"),
     [
-        ((), ABOVE, [[1.0, 0, -4.0], [0, 0, -2.0]], "ground"),
+        pytest.param((), ABOVE, [[1.0, 0, -4.0], [0, 0, -2.0]], "ground", marks=pytest.mark.slow),
         ((), SIDE, [[2.0, 0, 0], [-2.0, 0, 0]], "drone 1"),
         ((Box(pos=(0.5, 0, 1.5), size=(0.1, 9.0, 9.0)),), SIDE[:1], [[4.0, 0, 0]], "obstacle 0"),
-        ([Sphere(pos=(x, 0, 1.5), radius=0.1) for x in (9.0, 0.5)], SIDE[:1], [[4.0, 0, 0]], "obstacle 1"),
+        pytest.param(
+            [Sphere(pos=(x, 0, 1.5), radius=0.1) for x in (9.0, 0.5)], SIDE[:1], [[4.0, 0, 0]], "obstacle 1",
+            marks=pytest.mark.slow,
+        ),
         ("urdf", SIDE[:1], [[4.0, 0, 0]], "obstacle 0"),
     ],
 )  # fmt: skip
@@ -60,6 +63,7 @@ def test_a_flight_into_something_is_the_same_as_with_all_drones_in_the_collision
     assert touched in flights[0][1]
 
 
+@pytest.mark.slow
 def test_a_step_in_the_air_needs_six_calls_a_drone(monkeypatch):
     """Two set it, two push it, two read it; one is the step."""
     team, calls = jd.repeat(jd.load_params("cf2x"), 10), Counter()

@@ -51,6 +51,7 @@ def test_free_flight_equals_the_explicit_backend(team, rotors):
     assert_same_motion(theirs, ours, 1e-9)  # both integrate the same equations in float64 (measured: 1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotors", mostly_slow(ROTORS, [jaxdrones.lagging_rotors]))
 def test_motors_are_limited_as_on_the_explicit_backend(team, rotors):
     """Commands of twice the highest speed and of -1,000 RPM, and a start out of range, fly as the nearest limits."""
@@ -68,6 +69,7 @@ def test_motors_are_limited_as_on_the_explicit_backend(team, rotors):
     assert np.all(unlimited.rpm > ends[0].rpm)
 
 
+@pytest.mark.slow
 def test_substeps_are_repeated_steps(team, step):
     start, (command,) = apart(flying(team)), np.asarray(tape(team, 1))
     with bullet.make_step(**EVERYTHING, substeps=3) as three:
@@ -128,6 +130,7 @@ def test_the_same_input_gives_the_same_output_whatever_was_called_between(step, 
     assert_close(step(params, state, still), first, 0.0)
 
 
+@pytest.mark.slow
 def test_a_rollout_is_the_same_in_a_loop_and_compiled(step):
     params, start = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1), falling([0, 0, 0.05], vel=(0.3, 0, 0))
 
@@ -162,6 +165,7 @@ def test_an_obstacle_carries_a_drone():
     assert abs(state.pos[0, 2] - 0.6125) < 2e-3
 
 
+@pytest.mark.slow
 def test_float32_comes_back_as_float32(step):
     with jax.enable_x64(False):
         params = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)

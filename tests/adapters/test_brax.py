@@ -21,6 +21,7 @@ with contextlib.redirect_stdout(sys.stderr):
 pytestmark = pytest.mark.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", mostly_slow(TASKS, ["swap-goals"]))
 def test_a_step_returns_what_it_was_given_as_the_trainers_scan_over_it(task, env_of):
     env = brax.wrap(env_of(task))
@@ -90,6 +91,7 @@ def test_a_cut_is_told_from_an_end():
     assert steps[first[0] + 1, 0] == 1  # of the next episode
 
 
+@pytest.mark.slow
 def test_a_team_whose_drones_end_alone_goes_on_until_its_last_is_cut():
     """Also beyond its own time limit; a drone that left, and was moved far away, is not counted in its metrics."""
     late = {"late": lambda task, world: world.step >= jnp.array([2, 6])}

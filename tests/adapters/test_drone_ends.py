@@ -22,6 +22,7 @@ def env():
     return envs.make(dataclasses.replace(task, terminations=over, ends="drone"))
 
 
+@pytest.mark.slow
 def test_an_agent_of_pettingzoo_leaves(env):
     from pettingzoo.test import parallel_api_test
 

@@ -63,6 +63,7 @@ def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
     assert reward == reward_by_drone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "one_rule, many_rule", [("sum", "mean"), *(pytest.param(x, x, marks=pytest.mark.slow) for x in ("sum", "mean"))]
 )
@@ -220,6 +221,7 @@ def test_the_next_episode_begins_in_the_step_after_the_end(vector_of):
     assert not first[3].any() and first[-1]["_reward_position"].all() and not np.array_equal(first[0], starts)
 
 
+@pytest.mark.slow
 def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of):
     envs = vector_of(AutoresetMode.DISABLED)
     start, _ = envs.reset(seed=[5, None, 1])
@@ -270,7 +272,10 @@ def test_observation_wrappers_of_gymnasium_run(wrapper, mode, vector_of):
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # gymnasium compares bounds with float64's range
-@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "FlattenObservation", "DtypeObservation"])
+@pytest.mark.parametrize(
+    "wrapper",
+    mostly_slow(["NormalizeObservation", "FlattenObservation", "DtypeObservation"], ["DtypeObservation"]),
+)
 def test_observation_wrappers_of_one_environment_run(wrapper, env_of):
     given = {"dtype": np.float64} if wrapper == "DtypeObservation" else {}
     by_drone = wrapper == "FlattenObservation"
@@ -292,6 +297,7 @@ def test_a_time_limit_is_that_of_the_adapter_and_not_of_the_environment_it_was_g
     assert env.steps == 5
 
 
+@pytest.mark.slow
 def test_wrappers_of_gymnasium_understand_the_infos(vector_of):
     envs = RecordEpisodeStatistics(vector_of())
     envs.reset(seed=0)
@@ -305,6 +311,7 @@ def test_wrappers_of_gymnasium_understand_the_infos(vector_of):
     assert infos[2]["final_info"]["episode"]["l"] == 5 and "metric_error" in infos[2]["final_info"]
 
 
+@pytest.mark.slow
 def test_arrays_are_ones_own_or_not_copied_at_all(env_of, vector_of):
     envs = vector_of()
     first, _ = envs.reset(seed=0)

@@ -58,6 +58,7 @@ def test_truncation_may_be_separate_as_in_gymnax_1(env_of):
     assert not np.allclose(obs, info["final_observation"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("separate_truncation", mostly_slow([False, True], [False]))
 def test_a_step_without_reset_stays_in_the_episode(separate_truncation, env_of):
     env = gymnax.wrap(env_of("hover", drones=2, duration=0.02), separate_truncation=separate_truncation)

@@ -58,6 +58,7 @@ def test_a_world_of_many_looks_as_it_does_alone():
     assert np.unique(pictures[0][..., 0]).size > 20
 
 
+@pytest.mark.slow
 def test_rendering_needs_its_mode(recwarn):
     envs = VectorEnv("hover", 2)
     envs.reset(seed=0)

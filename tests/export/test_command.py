@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import mostly_slow
 
 import jaxdrones as jd
 from benchmarks import exported
@@ -134,7 +135,7 @@ def test_onnx_has_the_meaning_of_its_numbers_and_a_dynamic_batch(env, tmp_path):
 
 
 @needs_flatbuffers
-@pytest.mark.parametrize("library", ["linen", "nnx", "equinox"])
+@pytest.mark.parametrize("library", mostly_slow(["linen", "nnx", "equinox"], ["nnx"]))
 def test_a_network_of_a_user_leaves_as_stablehlo(library, env, tmp_path):
     if library == "linen":
         module = nn.Dense(4)

@@ -8,6 +8,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+from helpers import mostly_slow, mostly_slow_rows
 
 import jaxdrones as jd
 from benchmarks import exported
@@ -44,6 +45,8 @@ POLICIES = {
     "team": ("leader-follower", {}, {}),
 }
 
+QUICK = ("mlp", "gru", "set")
+
 
 @functools.cache
 def made(kind: str) -> tuple:
@@ -60,7 +63,7 @@ def difference(actions: np.ndarray, expected: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("to", TARGETS)
-@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("kind", mostly_slow(POLICIES, QUICK))
 def test_what_is_exported_acts_as_the_policy(kind, to, tmp_path):
     env, policy, inputs, expected = made(kind)
     assert 0.1 < np.abs(expected).mean() < 0.95  # where a difference is seen
@@ -69,6 +72,7 @@ def test_what_is_exported_acts_as_the_policy(kind, to, tmp_path):
     assert difference(exported.RUN[to](one.files[0], inputs), expected) < TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", TARGETS)
 def test_drones_with_their_own_networks_have_a_file_each(to, tmp_path):
     env = made("team")[0]
@@ -97,6 +101,7 @@ def flown() -> dict[str, np.ndarray]:
     return {"obs": np.stack(found)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", TARGETS)
 def test_what_is_exported_acts_as_the_policy_in_flight(to, tmp_path):
     (env, policy, *_), inputs = made("mlp"), flown()
@@ -133,7 +138,10 @@ MISTAKES = [  # kind of policy, and what is written in place of what
 
 
 @needs_cc
-@pytest.mark.parametrize(("kind", "text", "mistake"), MISTAKES)
+@pytest.mark.parametrize(
+    ("kind", "text", "mistake"),
+    mostly_slow_rows(MISTAKES, [case for case in MISTAKES if case[0] in ("mlp", "gru", "set")]),
+)
 def test_the_comparison_sees_a_mistake(kind, text, mistake, tmp_path):
     env, policy, inputs, expected = made(kind)
     (one,) = save(policy, env, "c", tmp_path)

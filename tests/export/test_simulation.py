@@ -42,13 +42,17 @@ def test_a_function_in_javascript_has_the_values_of_jax():
         return {"a": chosen @ either, "b": summed, "c": jnp.floor(3 * x) + jnp.sign(y)}
 
     text = javascript("f", function, x=jnp.zeros(3), y=jnp.zeros(3))
-    for seed in range(20):
-        x, y = np.random.default_rng(seed).normal(size=(2, 3)) * 1.5
-        x[seed % 3] = (y[seed % 3], 0.0, 0.5, y[seed % 3])[seed % 4]  # where branches meet
-        y[(seed + 1) % 3] = 1.0
-        found = in_node(f"(() => {{ {text}\nconst out = []; f(out, a, b); return out; }})()", x.tolist(), y.tolist())
-        expected = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(jax.jit(function)(x, y))])
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    xs, ys = np.random.default_rng(0).normal(size=(2, 20, 3)) * 1.5
+    for k, (x, y) in enumerate(zip(xs, ys, strict=True)):
+        x[k % 3] = (y[k % 3], 0.0, 0.5, y[k % 3])[k % 4]  # where branches meet
+        y[(k + 1) % 3] = 1.0
+    found = in_node(
+        f"(() => {{ {text}\nreturn a.map((x, k) => {{ const out = []; f(out, x, b[k]); return out; }}); }})()",
+        xs.tolist(),
+        ys.tolist(),
+    )
+    expected = jax.tree.leaves(jax.jit(jax.vmap(function))(xs, ys))
+    np.testing.assert_allclose(found, np.column_stack(expected), rtol=1e-12, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +132,7 @@ def test_a_thousand_steps_in_javascript_are_those_of_the_environment_in_float32(
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pilot", ["pid", "geometric", "mellinger"])
 def test_a_controller_in_the_page_flies_to_the_goal_and_stays(pilot, made):
     """Far enough and pushed a little; all four rotors turn at the speeds that the controller of JAX commands."""
@@ -157,6 +162,7 @@ def test_a_function_of_a_user_flies_to_the_goal_and_stays():
     assert np.linalg.norm(found[0] - GOAL) > 0.3 and np.linalg.norm(found[-1] - GOAL) < 0.03
 
 
+@pytest.mark.slow
 def test_push_mass_and_weight_obey_newton(made):
     """Falling with stopped rotors, and pushed: a = F / m - g, less a little drag."""
     text = (

@@ -63,6 +63,7 @@ def test_a_simulation_that_begins_in_flight_hovers_at_once(flown):
     np.testing.assert_allclose(hovering.sim_pwm[-1], duty * FULL_PWM, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_simulation_from_the_ground_overshoots_by_the_integrators_of_the_climb(flown):
     """The drone overshoots as the real one does, by an integrator that wound up on the ground, and then settles."""
     _, (_, climbing) = flown

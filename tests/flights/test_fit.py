@@ -161,6 +161,7 @@ def test_the_firmware_has_the_gains_of_the_propellers(monkeypatch, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, motors, crazyflie_motors("2.1"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_fit_is_written_without_matplotlib_and_never_over_another(
     flown, columns, monkeypatch, tmp_path, capsys, hidden

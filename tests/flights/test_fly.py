@@ -36,6 +36,7 @@ def test_the_circle_is_flown_with_the_known_steady_lag(circle):
     assert diverged(circle) == {}
 
 
+@pytest.mark.slow
 def test_the_circle_has_smooth_rotors_at_120_hz_and_a_limit_cycle_at_48_hz(circle):
     assert max(row["rpm_std"] for row in results(circle)) < 1
     cycling = fly("circle", drones=1, control_hz=48, duration=6)

@@ -154,6 +154,7 @@ def test_images_that_are_none_are_refused(columns, tmp_path, t, frames):
         read_log(tmp_path / "flight.npz")
 
 
+@pytest.mark.slow
 def test_what_fly_wrote_is_fitted(tmp_path, capsys):
     """The thrust of the vehicle that flew, from the log of each drone of a team at 120 Hz."""
     assert main(["fly", "circle", "--drones", "2", "--duration", "3", "--output", str(tmp_path), "--no-figure"]) == 0

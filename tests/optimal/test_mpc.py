@@ -53,6 +53,7 @@ def test_constants_that_are_symbols_are_given_at_each_call():
     assert np.all(heavy > 1.01 * light)
 
 
+@pytest.mark.slow
 def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_last_safe_command_or_an_error():
     mpc, team = controller(horizon=4), team_of("cf2x")
     params, state = one(team), one(hovering(team))

@@ -55,10 +55,10 @@ def _candidates(hessian, gradient, low, high):
 
 
 def test_importance_prefers_what_costs_less_and_leaves_out_what_is_not_finite():
-    weights = importance(jnp.array([3.0, 1.0, jnp.inf, 2.0, jnp.nan]), jnp.array(0.5))
+    weights = np.asarray(jax.jit(importance)(jnp.array([3.0, 1.0, jnp.inf, 2.0, jnp.nan]), 0.5))
     assert weights[1] > weights[3] > weights[0] > 0 and weights[2] == weights[4] == 0
-    np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
-    np.testing.assert_allclose(importance(jnp.ones(4), jnp.array(0.5)), 0.25, rtol=1e-12)
+    np.testing.assert_allclose(np.sum(weights), 1, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(importance)(jnp.ones(4), 0.5), 0.25, rtol=1e-12)
 
 
 @functools.cache
@@ -123,6 +123,7 @@ def test_settings_that_make_no_sense_are_refused(module, option, least):
     assert getattr(module.settings(_step(), **{option: least}), option) == least
 
 
+@pytest.mark.slow
 def test_setpoints_that_do_not_fit_the_horizon_are_refused():
     team = team_of("cf2x")
     params, state, short = one(team), one(hovering(team)), Setpoint.at(jnp.zeros((3, 3)))
@@ -151,6 +152,7 @@ def _blank(module, settings, params, state):
     return blank.replace(rpm=jnp.full(4, 12345.0), **({"key": keys[0]} if keys else {}))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("module", mostly_slow([mppi, ilqr], [mppi]), ids=["mppi", "ilqr"])
 def test_a_planner_moves_its_plan_on_by_a_step_or_drops_it_and_holds_its_command(module):

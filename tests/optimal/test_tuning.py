@@ -94,10 +94,11 @@ def test_no_gradient_of_a_flight_is_longer_than_the_limit_and_broken_ones_do_not
 
 def test_gains_with_which_one_flight_becomes_much_worse_are_not_the_best():
     start, better, lost, broken = [-3.0, -3.0], [-3.5, -2.9], [-9.0, 3.5], [-9.0, jnp.nan]
-    costs = np.asarray(tuning._costs(jnp.array([start, better, lost, broken])))
+    costs_of = jax.jit(tuning._costs)
+    costs = np.asarray(costs_of(jnp.array([start, better, lost, broken])))
     np.testing.assert_allclose(costs[:3], [-3.0, -3.2, 3.25])
     assert np.isinf(costs[3]) and np.argmin(costs) == 1
-    assert np.argmin(tuning._costs(jnp.array([[-3.0, jnp.inf], [-2.0, 4.0]]))) == 1  # the start itself breaks
+    assert np.argmin(costs_of(jnp.array([[-3.0, jnp.inf], [-2.0, 4.0]]))) == 1  # the start itself breaks
 
 
 def test_what_cannot_be_tuned_is_refused():

@@ -66,6 +66,7 @@ def test_a_bag_opens_in_an_independent_reader(recorded):
     assert bytes(picture.data) == pixels and picture.encoding == "rgb8"
 
 
+@pytest.mark.slow
 def test_a_flight_comes_back_from_its_bag(tmp_path):
     record = fly("circle", drones=2, duration=0.25)
     bag.write_flight(record, tmp_path / "bag")

@@ -6,7 +6,7 @@ import math
 import jax
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, mostly_slow
 from in_process import InProcess, Peer, Wire, positions
 from ros2_team import HZ, make_simulation, nanoseconds, team_step
 
@@ -37,6 +37,7 @@ def test_every_step_is_published_once_for_every_drone():
     assert flown.steps == 20 and flown.published == sum(map(len, wire.sent.values())) and flown.late == 0
 
 
+@pytest.mark.slow
 def test_drones_fly_where_they_are_told():
     wire = Wire()
     node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=5.0))
@@ -62,9 +63,10 @@ def test_velocities_turn_with_the_heading():
     np.testing.assert_allclose(np.hypot(body.linear.x, body.linear.y), 0.5, atol=0.1)
 
 
+@pytest.mark.slow
 def test_body_rates_and_thrust_are_flown():
     wire = Wire()
-    node, _ = make_node(wire, n=1)
+    node, _ = make_node(wire)
     peer = Peer(wire, 1)
     twist = msg.Twist(msg.Vector3(z=11.0), msg.Vector3(x=1.0))
     wire.script = [(0.0, lambda: peer.send(0, "cmd_rates", twist))]
@@ -98,7 +100,8 @@ def test_in_lockstep_a_tape_of_rotor_speeds_is_flown_bit_for_bit_as_by_the_engin
     assert_close(node._flight.state, state, atol=0)
 
 
-@pytest.mark.parametrize("silent_from", [0.0, 0.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("silent_from", mostly_slow([0.0, 0.5], [0.5]))
 def test_a_lost_peer_leaves_drones_that_hover_at_their_last_target(silent_from):
     wire = Wire()
     node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=0.3, wait=1.0))
@@ -139,7 +142,7 @@ def test_a_flight_stops_with_its_peer_if_asked_to():
     assert wire.now == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.parametrize("action", ["hover", "land", "stop"])
+@pytest.mark.parametrize("action", mostly_slow(["hover", "land", "stop"], ["stop"]))
 def test_without_calls_of_the_step_service_the_failsafe_acts(action):
     wire = Wire()
     node, warnings = make_node(wire, lockstep=True, failsafe=Failsafe(action, wait=0.5))
@@ -152,7 +155,7 @@ def test_without_calls_of_the_step_service_the_failsafe_acts(action):
     assert warnings == ["the step service was not called for 0.5 s; the flight continues by the clock"]
 
 
-@pytest.mark.parametrize("action", ["hover", "stop"])
+@pytest.mark.parametrize("action", mostly_slow(["hover", "stop"], ["stop"]))
 def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
     wire = Wire()
     wire.wrong = ["a peer publishes /drone_0/cmd_vel as geometry_msgs/msg/Pose; its type is geometry_msgs/msg/Twist"]
@@ -166,7 +169,7 @@ def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
 
 def test_refused_messages_of_a_kind_are_said_once_whatever_their_numbers():
     wire = Wire()
-    node, warnings = make_node(wire, n=1)
+    node, warnings = make_node(wire)
     peer = Peer(wire, 1)
     bad = {  # of each kind, k-th message -> message
         "cmd_motors": [
@@ -200,6 +203,7 @@ def test_images_come_at_the_rate_of_the_camera():
     assert len(wire.sent["drone_1/camera/camera_info"]) == 6
 
 
+@pytest.mark.slow
 def test_more_images_than_control_steps_are_refused():
     with pytest.raises(UserError, match="101 images/s; give at most the control rate, 100"):
         make_node(Wire(), camera=Camera(resolution=(8, 6), rate=101.0))
@@ -207,7 +211,7 @@ def test_more_images_than_control_steps_are_refused():
 
 def test_a_slow_computer_is_counted_and_not_caught_up_with():
     wire = Wire()
-    node, _ = make_node(wire, n=1)
+    node, _ = make_node(wire)
 
     def stall():
         wire.now += 0.5
@@ -217,6 +221,7 @@ def test_a_slow_computer_is_counted_and_not_caught_up_with():
     assert flown.late == 1 and wire.now == pytest.approx(0.7, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_flies_behind_the_same_topics():
     import jaxdrones as jd

@@ -104,6 +104,7 @@ def test_a_flight_that_diverges_is_logged_and_reported(flight, tmp_path, capsys)
     assert (tmp_path / "log.npz").exists() and (tmp_path / "flight.png").exists()
 
 
+@pytest.mark.slow
 def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
     assert main(["fly", "circle", *SHORT, "--json", "--no-figure", "--output", str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out)["diverged"] == {}

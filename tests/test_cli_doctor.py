@@ -27,8 +27,12 @@ def no_flight(monkeypatch):
     monkeypatch.setattr(self_test, "self_test", lambda backend: None)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
-@pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
+@pytest.mark.parametrize(
+    "backend",
+    ["explicit", pytest.param("bullet", marks=[pytest.mark.needs("pybullet"), pytest.mark.slow])],
+)
 def test_the_self_test_passes_on_either_backend(backend):
     assert self_test.self_test(backend) is None
 

@@ -37,6 +37,7 @@ def trained(tmp_path_factory):
     return folder, json.loads(out.getvalue())
 
 
+@pytest.mark.slow
 def test_training_writes_policies_state_progress_figure_and_report(trained):
     folder, printed = trained
     run = Run(folder)
@@ -109,6 +110,7 @@ def nothing_compiles(monkeypatch):
     monkeypatch.setattr(trainer.Trainer, "compile", compile)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--seed", "3"], ["--seeds", "2"], ["--algo", "shac"], ["--budget", "1s"]])
 def test_a_finished_training_is_not_replaced_unasked(more, trained, nothing_compiles, capsys):
     folder, _ = trained
@@ -119,6 +121,7 @@ def test_a_finished_training_is_not_replaced_unasked(more, trained, nothing_comp
     assert said.count("\n") == 1 and contents(folder) == before
 
 
+@pytest.mark.slow
 def test_the_default_folder_and_those_of_seeds_are_not_replaced_unasked(
     trained, tmp_path, nothing_compiles, capsys, monkeypatch
 ):
@@ -405,6 +408,7 @@ def test_all_episodes_but_one_never_read_as_all_and_one_never_as_none(episodes):
     assert float(percent(1 / episodes, episodes).split()[0]) > 0
 
 
+@pytest.mark.slow
 def test_eval_prints_one_object(trained, capsys):
     folder, _ = trained
     assert main(["eval", str(folder), "--episodes", "8", "--json"]) == 0

@@ -95,7 +95,7 @@ FLIGHTS |= {
     "doctor": Short("versions ... devices ... self-test"),
     "bench": Short("jaxdrones", "--worlds 64 --seconds 1"),
 }
-QUICK = ("fly circle", "compare circle", "list", "explain hover")
+QUICK = ("list", "explain hover")
 TRAININGS = {
     "train hover": Short(TRAINED, TRAINING),
     "train leader-follower --algo ppo --seeds 3 --budget 60s": Short(

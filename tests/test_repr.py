@@ -50,7 +50,13 @@ LINES = {  # what makes an object, and what is printed of it
 }
 
 
-@pytest.mark.parametrize(("make_thing", "line"), LINES.values(), ids=LINES)
+@pytest.mark.parametrize(
+    ("make_thing", "line"),
+    [
+        pytest.param(*case, id=name, marks=pytest.mark.slow if name in ("policy", "policies") else ())
+        for name, case in LINES.items()
+    ],
+)
 def test_one_line_says_what_it_is(make_thing, line):
     thing = make_thing()
     assert line in repr(thing) == str(thing)

@@ -20,6 +20,7 @@ GRAVITY = 9.81  # m/s^2, of the identifications
 RPM = 2 * np.pi / 60  # rad/s
 
 
+@pytest.mark.slow
 def test_every_vehicle_goes_where_the_geometric_controller_sends_it():
     error = reaches(geometric, EVERY, (0.3, -0.3, 1.3), seconds=4, hz=240)
     assert np.all(error[-1] < 1e-3)

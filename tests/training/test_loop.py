@@ -8,7 +8,7 @@ import time
 import jax
 import numpy as np
 import pytest
-from helpers import SMALL_TRAINING
+from helpers import SMALL_TRAINING, mostly_slow
 
 from jaxdrones.training import loop, plan
 from jaxdrones.training.recipe import Recipe
@@ -92,7 +92,7 @@ def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole,
     assert numbers(run) == numbers(whole)
 
 
-@pytest.mark.parametrize("name", ["best", "last", "state", "report"])
+@pytest.mark.parametrize("name", mostly_slow(["best", "last", "state", "report"], ["best", "state"]))
 def test_a_file_of_another_training_is_refused_though_it_is_whole(name, trainer, whole, tmp_path):
     """Also where the other training has the same recipe and seed: its numbers may be those of another machine."""
     other = shutil.copytree(whole.folder, tmp_path / "run")
@@ -147,12 +147,12 @@ def test_a_rate_that_no_evaluation_reaches_is_refused():
 @pytest.mark.parametrize(
     ("seconds", "update", "evaluation", "drift"),
     [
-        (60, 0.6, 0.5, 1.0),
-        (60, 0.6, 0.5, 2.0),
-        (60, 0.6, 0.5, 0.5),
         (60, 3.0, 6.0, 1.0),
         (240, 0.9, 20, 1.5),
-        (9, 0.1, 0, 1),
+        pytest.param(60, 0.6, 0.5, 1.0, marks=pytest.mark.slow),
+        pytest.param(60, 0.6, 0.5, 2.0, marks=pytest.mark.slow),
+        pytest.param(60, 0.6, 0.5, 0.5, marks=pytest.mark.slow),
+        pytest.param(9, 0.1, 0, 1, marks=pytest.mark.slow),
     ],
 )
 def test_a_budget_holds_to_a_tenth_whatever_updates_and_evaluations_take(

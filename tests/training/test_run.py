@@ -112,6 +112,7 @@ def test_a_recipe_survives_json(realistic):
     assert recipe.env().observation_size > 0
 
 
+@pytest.mark.slow
 def test_realistic_hover_trains_with_longer_delays_than_in_flight_unless_a_delay_is_given():
     recipe, given = Recipe.of("hover", realistic=True), Recipe.of("hover", realistic=True, delay=0.01)
     assert recipe.env().delay == (0.0, 0.04) and recipe.env(practice=True).delay == (0.0, 0.05)
@@ -119,6 +120,7 @@ def test_realistic_hover_trains_with_longer_delays_than_in_flight_unless_a_delay
     assert Recipe.of("hover", realistic="any").env(practice=True).delay == (0.0, 0.04)
 
 
+@pytest.mark.slow
 def test_only_ppo_for_realistic_hover_trains_with_the_reward_for_precision_and_none_flies_with_it():
     trained = {
         (algorithm, realistic): "near"

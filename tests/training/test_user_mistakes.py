@@ -285,6 +285,7 @@ def said(capsys, make) -> str:
     return line
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_a_mistake_in_a_task_is_one_line_that_names_the_file_and_the_field(capsys):
     Path("fine.py").write_text(TASK)

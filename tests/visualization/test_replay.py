@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import mostly_slow
 from matplotlib.image import imread
 from PIL import Image
 
@@ -52,7 +53,7 @@ def test_a_film_may_be_a_gif(record, tmp_path):
 
 
 @pytest.mark.needs("pybullet")
-@pytest.mark.parametrize("name", ["short.mp4", "short.gif", "-x:y %d.mp4"])
+@pytest.mark.parametrize("name", mostly_slow(["short.mp4", "short.gif", "-x:y %d.mp4"], ["-x:y %d.mp4"]))
 def test_the_shortest_flight_is_one_frame_whatever_its_file_is_called(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert films.film(fly("circle", drones=2, duration=0.01), Path(name), "", "bullet", size=(320, 180)) == 1

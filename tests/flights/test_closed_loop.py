@@ -72,6 +72,7 @@ def test_a_simulation_from_the_ground_overshoots_by_the_integrators_of_the_climb
     assert abs(climbing.sim_pos[-1, 2] - HEIGHT) < 0.05
 
 
+@pytest.mark.slow
 def test_a_part_of_a_large_sag_does_not_reach_the_motors(flown):
     """A drone whose battery sags by 0.8 V needs the PWM of one with half of 0.25 V more."""
     vehicle, (hovering, climbing) = flown

@@ -15,7 +15,7 @@ SIGNS = np.array([1, -1, -1, 1])
 DOWN = np.array([1, 1, -1])
 
 
-@pytest.fixture(scope="module", params=["flown", "B3_figure8_slow_rep2"])
+@pytest.fixture(scope="module", params=[pytest.param("flown", marks=pytest.mark.slow), "B3_figure8_slow_rep2"])
 def sound(request, flown, columns_of):
     """The columns of a simulated flight, and those of a recorded one."""
     return columns_of(flown[1] if request.param == "flown" else load_flights(request.param)[0])

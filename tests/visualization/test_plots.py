@@ -112,6 +112,7 @@ def test_outlines_of_obstacles_have_their_area():
     np.testing.assert_allclose(area(paths.outlines(scene, x, z)[2]), 0.8, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_invalid_settings_of_matplotlib_are_a_users_mistake():
     """In a process of its own, as they are read when it is imported."""
     script = "from jaxdrones.visualization import plots; plots.check_matplotlib()"

@@ -31,9 +31,8 @@ crazyflie: .venv/installed .venv-crazyflie/installed  ## install cflib (GPL-2.0)
 tables: .venv/installed  ## measure the tables of the pages again; on idle cores
 	$(BIN)/python -m benchmarks.tables
 
-test: .venv/installed  ## the quick tests; compiled with few optimizations, in three quarters of the time (the slow tests with all)
-	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0" \
-		$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
+test: .venv/installed
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
 
 test-slow: .venv/installed  ## all of them, or a part: make test-slow ONLY="--shard 2/6 --since '3 hours ago'"
 	$(BIN)/pytest -n 2 --dist load -m slow $(ONLY)

@@ -161,9 +161,7 @@ def in_worlds(quats):
 def test_angles_in_single_precision_are_right_however_they_are_compiled(count, near):
     quats = attitudes(count, near)
     check_angles(quats, in_worlds(quats))
-    for fused, level in (True, 3), (False, 0):
-        options = {"xla_cpu_use_fusion_emitters": fused, "xla_backend_optimization_level": level}
-        check_angles(quats, jax.jit(jax.vmap(rotation.to_rpy), compiler_options=options)(quats))
+    check_angles(quats, jax.jit(jax.vmap(rotation.to_rpy))(quats))
     check_angles(quats, jax.vmap(rotation.to_rpy)(quats))  # eager
     check_angles(quats[-5:], [jax.jit(rotation.to_rpy)(quat) for quat in quats[-5:]])
 

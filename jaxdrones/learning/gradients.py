@@ -115,7 +115,9 @@ def _limited(limit: Scalar, cotangent: Any) -> tuple[Any, None]:
     length = jnp.sqrt(sum(jnp.sum(x**2, axis=tuple(range(1, x.ndim))) for x in leaves))
     counts = jnp.isfinite(length) & (length > 0)
     ordered, count = jnp.sort(jnp.where(counts, length, jnp.inf)), jnp.sum(counts)
-    longest = limit * (ordered[jnp.maximum(count - 1, 0) // 2] + ordered[count // 2]) / 2
+    rank = jnp.arange(len(ordered))
+    middle = 1 * (rank == (count - 1) // 2) + (rank == count // 2)
+    longest = limit * jnp.sum(jnp.where(middle > 0, middle * ordered, 0)) / 2
     scale = jnp.where(length > longest, longest / jnp.where(length > 0, length, 1), 1)
     scale = jnp.where(jnp.isfinite(length), scale, 0)
 

@@ -111,14 +111,15 @@ def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params
 
 def check_starts(randomize: Sequence[Randomization], task: Task, params: Params, scene: Scene) -> None:
     """Raise if the drones of a team would start in each other with the largest vehicle that an episode may draw."""
-    for one in randomize:
-        if isinstance(one, AnyVehicle) and len(params.mass) > 1:
-            radius = jnp.full_like(params.collision_radius, vehicles.largest_radius(one.heaviest))
-            widest = params.replace(collision_radius=radius)
-            try:
-                jax.eval_shape(lambda key, scene: task.begin(key, widest, scene, 1.0), jax.random.key(0), scene)  # noqa: B023
-            except UserError as error:
-                raise UserError(f"with AnyVehicle(heaviest={one.heaviest:g}) {error}") from None
+    heaviest = next((one.heaviest for one in randomize if isinstance(one, AnyVehicle)), None)
+    if heaviest is None or len(params.mass) == 1:
+        return
+    radius = jnp.full_like(params.collision_radius, vehicles.largest_radius(heaviest))
+    widest = params.replace(collision_radius=radius)
+    try:
+        jax.eval_shape(lambda key, scene: task.begin(key, widest, scene, 1.0), jax.random.key(0), scene)
+    except UserError as error:
+        raise UserError(f"with AnyVehicle(heaviest={heaviest:g}) {error}") from None
 
 
 def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:

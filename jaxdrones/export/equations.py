@@ -69,7 +69,8 @@ def javascript(name: str, function: Callable, **arguments: Any) -> str:
 def _line(program: Any, k: int, names: list[str]) -> str:
     code, inputs, outputs = program.instruction_id(k), program.instruction_input(k), program.instruction_output(k)
     if code == casadi.OP_CONST:
-        return f"w{outputs[0]} = {_NOT_FINITE.get(constant := repr(program.instruction_constant(k)), constant)}"
+        constant = repr(program.instruction_constant(k))
+        return f"w{outputs[0]} = {_NOT_FINITE.get(constant, constant)}"
     if code == casadi.OP_INPUT:
         return f"w{outputs[0]} = {names[inputs[0]]}[{inputs[1]}]"
     if code == casadi.OP_OUTPUT:

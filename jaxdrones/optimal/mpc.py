@@ -174,12 +174,13 @@ class Mpc:
     def _solved(self, state: State, setpoints: Setpoint, params: Params | None) -> np.ndarray | None:
         """Concatenated states and commands of the plan; `None` without convergence."""
         model = self.model
-        target = jax.device_get(self._reference(self._with_constants(params), setpoints))
+        params = model.params if params is None else params
+        target = jax.device_get(self._reference(model.with_parameters(params), setpoints))
         rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(self.horizon + 1)]
         targets = np.stack([model.vector(row.state) for row in rows])
         nominal = np.stack([row.rpm for row in rows[:-1]]) / self._unit
         now = model.vector(state)[self._kept] / self._scale
-        constants = model.parameters(model.params if params is None else params)
+        constants = model.parameters(params)
         start = time.perf_counter()
         result = self._solver(
             x0=self._guess(now, targets, nominal),
@@ -194,14 +195,6 @@ class Mpc:
         self.message = str(said["return_status"])
         plan = np.asarray(result["x"]).ravel()
         return plan if said["success"] and np.isfinite(plan).all() else None
-
-    def _with_constants(self, params: Params | None) -> Params:
-        """Parameters of the model with the given values of its symbolic constants."""
-        known = self.model.params
-        if params is None:
-            return known
-        names = dict.fromkeys(name.partition("[")[0] for name in self.model.parameter_names)
-        return known.replace(**{name: np.asarray(getattr(params, name), float) for name in names})
 
     def _guess(self, now: np.ndarray, targets: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Last plan, shifted by one interval; at first the reference."""

@@ -69,8 +69,16 @@ class CasadiModel:
 
     def parameters(self, params: Params) -> np.ndarray:
         """(np,) values of the symbolic constants of the same drone or team."""
+        fields = self._symbolic(params).values()
+        return np.concatenate([np.zeros(0), *map(np.ravel, fields)])
+
+    def with_parameters(self, params: Params) -> Params:
+        """Constants of the model, with the given values of the symbolic ones."""
+        return self.params.replace(**self._symbolic(params))
+
+    def _symbolic(self, params: Params) -> dict[str, np.ndarray]:
         fields = dict.fromkeys(name.partition("[")[0] for name in self.parameter_names)
-        return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(getattr(params, name), float)) for name in fields)])
+        return {name: np.asarray(getattr(params, name), float) for name in fields}
 
 
 @checked

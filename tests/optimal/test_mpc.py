@@ -45,12 +45,13 @@ def test_at_the_target_the_plan_is_hover_and_far_off_it_keeps_to_the_limits():
 
 @pytest.mark.slow
 def test_constants_that_are_symbols_are_given_at_each_call():
-    """Twice the mass needs more thrust at once, though the model was made for the light drone."""
+    """A heavier drone hovers at its own speed, though the model was made for the light one."""
     mpc, team = controller(horizon=4, parameters=("mass",)), team_of("cf2x")
     params, state = one(team), one(hovering(team))
     stay = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (5, 3)))
-    light, heavy = mpc(state, stay), mpc(state, stay, params.replace(mass=1.2 * params.mass))
-    assert np.all(heavy > 1.01 * light)
+    heavy = params.replace(mass=1.2 * params.mass)
+    np.testing.assert_allclose(mpc(state, stay), np.full(4, params.hover_rpm), rtol=1e-5)
+    np.testing.assert_allclose(mpc(state, stay, heavy), np.full(4, heavy.hover_rpm), rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -113,16 +114,3 @@ def test_the_figure_eight_of_five_seconds_is_tracked_within_three_centimeters(so
         assert mpc.status == Status.OK
         errors.append(np.linalg.norm(state.pos[0] - target(jnp.array([(k + 1) * DT])).pos[0]))
     assert np.sqrt(np.mean(np.square(errors[40:]))) < 0.03
-
-
-def test_the_reference_of_a_plan_is_that_of_the_given_constants():
-    """A drone 30 % heavier than the model hovers at its own speed, and was held 3 mm away from the target."""
-    from jaxdrones.optimal.mpc import Mpc
-
-    mpc = object.__new__(Mpc)
-    mpc.model = model(parameters=("mass",))
-    params = jd.load_params("cf2x")
-    heavy = params.replace(mass=1.3 * params.mass, kf=2 * params.kf)  # of which the mass alone is a symbol
-    expected = jd.load_params("cf2x").replace(mass=1.3 * params.mass).hover_rpm
-    np.testing.assert_allclose(mpc._with_constants(heavy).hover_rpm, expected, rtol=1e-6)
-    assert mpc._with_constants(None) is mpc.model.params

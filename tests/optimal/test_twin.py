@@ -122,6 +122,8 @@ def test_constants_may_stay_symbols():
     expected = np.asarray(twin(params, [jd.drag]).function(x, u))
     found = np.asarray(model.function(x, u, model.parameters(params)))
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    given = model.with_parameters(params.replace(mass=1.3 * params.mass, kf=2 * params.kf))
+    np.testing.assert_allclose((given.mass, given.kf), (1.3 * model.params.mass, model.params.kf), rtol=1e-7)
 
 
 def test_models_with_loops_branches_and_states_of_their_own_have_a_twin():

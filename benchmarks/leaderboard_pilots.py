@@ -267,8 +267,8 @@ def raptor(scenario: Scenario, pilot: Pilot) -> Obtained:
 def any_vehicle(scenario: Scenario, pilot: Pilot) -> Obtained:
     """The bundled policy for all vehicles, with the cost of its training."""
     report = json.loads((assets.folder() / "any-vehicle" / "report.json").read_bytes())
-    config, env = report["recipe"]["config"], pilot.env(scenario)
-    flown = config["updates"] * config["worlds"] * config["horizon"] * env.dt
+    env, trainings = pilot.env(scenario), (report["recipe"]["config"], report["fine_tuned"])
+    flown = env.dt * sum(config["updates"] * config["worlds"] * config["horizon"] for config in trainings)
     return Obtained(make_policy("any-vehicle", env), sum(report["seconds"].values()), flown, "seed 0")
 
 

@@ -1,4 +1,5 @@
-"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle.
+"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle, which is
+then fine-tuned.
 
     python website/policies.py [NAME ...]
 
@@ -10,6 +11,8 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from fine_tuning import fine_tune
 
 ROOT = Path(__file__).parent.parent
 RUNS = ROOT / "runs" / "policies"
@@ -56,8 +59,11 @@ def main() -> None:
             (run / "commit").write_text(_git("rev-parse", "--short", "HEAD"))
         folder = BUNDLED.parent / _ANY if name == _ANY else BUNDLED / name
         folder.mkdir(parents=True, exist_ok=True)
-        for file in _FILES:
-            shutil.copy(run / file, folder / file)
+        if name == _ANY:
+            fine_tune(run, folder)
+        else:
+            for file in _FILES:
+                shutil.copy(run / file, folder / file)
         about = json.loads((folder / "report.json").read_bytes()) | {"commit": (run / "commit").read_text().strip()}
         (folder / "report.json").write_text(json.dumps(about, indent=2))
     rows = [_row(BUNDLED / task) for task in TASKS if (BUNDLED / task).exists()]

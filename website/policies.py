@@ -1,5 +1,4 @@
-"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle, which is
-then fine-tuned.
+"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`; fine-tunes the one for any vehicle.
 
     python website/policies.py [NAME ...]
 

@@ -174,6 +174,18 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
 
 
 @pytest.mark.slow
+def test_a_training_from_a_policy_starts_with_its_parameters(trained, tmp_path, capsys):
+    first = jax.tree.leaves(Run(trained[0]).policy())
+    command = [*TRAIN, "--seed", "5", "--output", str(tmp_path), "--no-figure"]
+    assert main([*command, "--from", str(trained[0]), "--keep-history"]) == 0
+    run = Run(tmp_path)
+    assert run.recipe().start_from == str(trained[0])
+    for name, same in ((run.kept[0], True), (run.kept[-1], False)):
+        assert all(np.array_equal(x, y) for x, y in zip(first, jax.tree.leaves(run.policy(name)), strict=True)) == same
+    assert main([*command, "--resume"]) == 0 and run.history()[-1]["update"] == 8
+
+
+@pytest.mark.slow
 def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, tmp_path, capsys, monkeypatch):
     folder = shutil.copytree(trained[0], tmp_path / "hover")
     resume = ["train", "hover", "--output", str(folder), "--resume", "--no-figure"]
@@ -326,6 +338,12 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--seeds", "0"], "seeds is 0"),
         (["train", "hover", "--resume"], "holds no training to continue"),
         (["train", "hover", "--resume", "--overwrite"], "--resume and --overwrite are given"),
+        (["train", "hover", "--resume", "--from", "hover"], "--resume and --from are given"),
+        (["train", "hover", "--from", "nowhere"], "no checkpoint at nowhere/best"),
+        (["train", "hover", "--from", "hovr"], "hovr is not a bundled policy; did you mean 'hover'"),
+        (["train", "hover", "--from", "raptor"], "give the folder of a run or the name of a bundled policy"),
+        (["train", "tracking", "--from", "hover"], "the environment tracking"),
+        (["train", "hover", "--from", "hover", "--set", "hidden_sizes=8,"], "-> 8 -> 4, tanh, 220 parameters"),
         (["train", "hover", "--algo", ""], "unknown algorithm ''"),
         (["train", "hover", "--seed", "-1"], "seed is -1"),
         (["train", "hover", "--seed", str(2**70)], "give at most 2147483647"),

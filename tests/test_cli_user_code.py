@@ -173,7 +173,7 @@ def test_settings_are_known_for_what_the_tables_name():
             0,
             3,
             True,
-            r"nothing was learned, the best policy is the untrained one of update 0 \(30\.0 % success\)",
+            r"nothing was learned, the best policy is the first one, of update 0 \(30\.0 % success\)",
         ),
         (20, 0, True, r"the best policy succeeds in 0 of 10 episodes; try --seeds 3"),
         (20, 0, False, None),

@@ -117,6 +117,9 @@ TRAININGS = {
     ),
     "train sling": Short(f"sling by bptt ... {TRAINED}", TRAINING),
     "train recovery --set recurrent_size=32": Short(f"recovery by bptt ... {TRAINED}", TRAINING),
+    "train hover --from hover --vehicle hb --output runs/hb": Short(
+        TRAINED, "--set worlds=8 --set horizon=4 --budget 2"
+    ),
     "train hover --resume": Short(TRAINED),
     "train hover --resume --budget 100": Short("updates: 102, 2 of them made ... " + TRAINED.split(" ... ", 1)[1]),
     "train hover --overwrite": Short(TRAINED, TRAINING),

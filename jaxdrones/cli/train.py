@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxdrones import arguments
 from jaxdrones.cli import machine, train_output
-from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
+from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.live import add_live, live_server, show_training
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle, option, switch
 from jaxdrones.cli.report import described
@@ -80,6 +80,13 @@ def add(commands) -> None:
     )
     option(schedule, "--seeds N", "train N seeds, each in DIR/seed-K", int, 1, check=_SEEDS)
     option(schedule, "--seed K", "first seed (0)", int, check=arguments.seed)
+    option(
+        schedule,
+        "--from RUN",
+        "start from the best policy of a run or a bundled one, with a new optimizer, not from random parameters",
+        folder,
+        dest="start_from",
+    )
     option(schedule, "--budget N|Ns", "number of updates, such as 300, or total time per seed, such as 60s, 5m or 2h")
     option(
         schedule,
@@ -160,7 +167,7 @@ def _train_row(request: Request, begin: float) -> int:
                 stack.enter_context(locked(folder, print_warning))
             runs = request.runs()
             with user_mistakes(request.settings, request.task):
-                trainer = Trainer(request.recipe(runs), request.episodes_of(runs))
+                trainer = Trainer(request.recipe(runs), request.episodes_of(runs), request.first_policy())
             for run in runs.values():
                 if run.started and request.resume:
                     loop.check_resumable(trainer, run)

@@ -33,7 +33,7 @@ def warn_of_failure(run, report: dict[str, Any]) -> None:
     share = "" if success is None else f" ({percent(success, episodes)} success)"
     if report["best_update"] == 0:
         print_warning(
-            f"{run.folder}: nothing was learned, the best policy is the untrained one of update 0{share}; {advice}"
+            f"{run.folder}: nothing was learned, the best policy is the first one, of update 0{share}; {advice}"
         )
     elif successes == 0:
         print_warning(f"{run.folder}: the best policy succeeds in 0 of {episodes:,} episodes; {advice}")

@@ -11,10 +11,11 @@ from typing import Any
 
 from jaxdrones import arguments
 from jaxdrones.cli.common import run_folder
-from jaxdrones.cli.policies import warn_of_code
+from jaxdrones.cli.policies import is_user_policy, open_policy, warn_of_code
 from jaxdrones.cli.settings import given_settings
 from jaxdrones.errors import UserError
 from jaxdrones.learning.loggers import logger_names
+from jaxdrones.learning.networks import Policy
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import user_files
 from jaxdrones.training.presets import default_algorithm
@@ -39,6 +40,8 @@ class Request(argparse.Namespace):
             arguments.seed("the last seed", options.seed + options.seeds - 1)
         if options.resume and options.overwrite:
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
+        if options.resume and options.start_from is not None:
+            raise UserError("--resume and --from are given; one continues a training, the other starts a new one")
         logger_names(options.log)
         updates, seconds = parse_budget(options.budget)
         settings = given_settings(options)
@@ -100,13 +103,22 @@ class Request(argparse.Namespace):
         started = (run.sidecar_entry("state", "episodes") for run in runs.values() if run.started and self.resume)
         return next(started, 1000 if self.episodes is None else self.episodes)
 
+    def first_policy(self) -> Policy | None:
+        """Policy of --from."""
+        if self.start_from is None:
+            return None
+        if is_user_policy(self.start_from):
+            raise UserError(f"--from is {self.start_from}; give the folder of a run or the name of a bundled policy")
+        return open_policy(self.start_from, None, False, {}).policy()
+
     def _new_recipe(self, runs: dict):
         algorithm = default_algorithm(self.task) if self.algo is None else self.algo
         recipe = Recipe.of(self.task, algorithm, self.realistic, **self.settings)
         for run in (*runs.values(), Run(self.output)):
             if run.files and not self.overwrite:
                 raise _not_free(run)
-        return dataclasses.replace(recipe, stop_at=self.stop_at)
+        start_from = None if self.start_from is None else str(self.start_from)
+        return dataclasses.replace(recipe, stop_at=self.stop_at, start_from=start_from)
 
     def _resumed_recipe(self, runs: dict):
         """Recipe of the runs with the requested number of updates; all other settings must be unchanged."""

@@ -38,6 +38,8 @@ class Recipe:
     """Texts of the user's files of task and vehicle."""
     stop_at: float | None = None
     """Lower bound of the success rate to stop at; `None` for all updates."""
+    start_from: str | None = None
+    """Folder or name of the run whose best policy the training starts from; `None` for random parameters."""
 
     @classmethod
     def of(

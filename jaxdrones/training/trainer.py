@@ -11,9 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.arguments import Count, checked
+from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
 from jaxdrones.learning.metrics import with_unknown
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.policies import check_fits
 from jaxdrones.learning.result import advance
 from jaxdrones.limits import check_memory
 from jaxdrones.training import algorithms
@@ -28,14 +32,20 @@ class Trainer:
     """Compiled programs of a recipe, shared by all seeds; worlds are sharded over all devices of all hosts."""
 
     @checked
-    def __init__(self, recipe: Recipe, episodes: Count = 1000):
-        """Prepare the programs, with this number of episodes in an evaluation; `compile` compiles them."""
+    def __init__(self, recipe: Recipe, episodes: Count = 1000, first_policy: Policy | None = None):
+        """Prepare the programs, with this number of episodes in an evaluation; `compile` compiles them.
+
+        Trainings start from `first_policy`, or from random parameters.
+        """
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.make_mesh(recipe.config.worlds, _devices(recipe.config))
         self.env, self.practice_env = recipe.env(), recipe.env(practice=True)
         self.learner = algorithms.learner(recipe.algorithm)
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
+        if first_policy is not None:
+            _check_first(first_policy, self.env, self.shapes.policy)
+        self.first_policy = first_policy
         self.disk_size = _DISK_FACTOR * size_of(self.shapes)
         """Bytes that a run must be able to write."""
         check_episodes(self.env, episodes)
@@ -51,17 +61,27 @@ class Trainer:
         self.compile_seconds = time.perf_counter() - start
 
     def compile(self) -> None:
-        """Compile the programs `start(key)`, `evaluate(policy, key)` and `advance`, the last one concurrently."""
+        """Compile the programs of `start`, `evaluate(policy, key)` and `advance`, the last one concurrently."""
         start = time.perf_counter()
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         init = compilation.jit(self._init, self.practice_env, in_shardings=same, out_shardings=state)
         with ThreadPoolExecutor(1) as beside:
             with jax.set_mesh(self.mesh):
                 updates = beside.submit(self._traced.lower().compile)
-                self.start = init.lower(jax.random.key(0)).compile()
+                self._start = init.lower(jax.random.key(0)).compile()
             self.evaluate = compile_evaluation(self.env, self.shapes.policy, self.episodes, self.mesh.local_devices)
             self._advance = updates.result()
         self.compile_seconds += time.perf_counter() - start
+
+    def start(self, key: jax.Array) -> Any:
+        """State before the first update."""
+        state = self._start(key)
+        if self.first_policy is None:
+            return state
+        put = jax.tree.map(
+            lambda x, own: jax.device_put(x.astype(own.dtype), own.sharding), self.first_policy, state.policy
+        )
+        return state.replace(policy=put)
 
     def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
         """Run at most `MAX_CALL` updates in one call: the next state, and (updates,) of every metric."""
@@ -83,6 +103,16 @@ class Trainer:
     def _updates(self, state, count, total):
         """Run `count` updates of a training of `total` updates; both can change without recompilation."""
         return advance(self.learner.update, self.practice_env, self.recipe.config, state, count, total)
+
+
+def _check_first(policy: Policy, env: Env, expected: Policy) -> None:
+    """Raise unless a policy to start from has the network of the settings."""
+    check_fits("to start from", policy, env)
+    if jax.tree.map(np.shape, policy) != jax.tree.map(np.shape, expected):
+        raise UserError(
+            f"the policy to start from is {policy}, that of the settings {expected}; give the settings of its network, "
+            "for example hidden_sizes"
+        )
 
 
 def _devices(config: Any) -> list[jax.Device]:

@@ -5,6 +5,8 @@ import dataclasses
 import hashlib
 import json
 import re
+import shutil
+import subprocess
 from html import unescape
 
 import jax
@@ -169,6 +171,32 @@ def test_the_page_was_built_from_its_sources():
         pytest.skip("the page is not built: there is no npm")
     built = path.read_text()
     assert f"sources sha256 {digest}" in built, "the sources of the viewer have changed; run `make viewer`"
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+@pytest.mark.parametrize("rows", [1, 100, 401, 4_001, 100_003])
+def test_plots_of_long_flights_show_every_short_peak(rows):
+    """A peak of one row, up or down, is drawn wherever it is, and a curve is not drawn with more points than needed."""
+    code = f"""
+    import {{ extremes }} from {json.dumps((ROOT / "viewer" / "src" / "extremes.js").as_uri())};
+    const rows = {rows}, found = [];
+    for (const peak of [0, 0.333, 0.5, 0.7777, 0.99999].map((x) => Math.floor(x * rows))) {{
+      for (const height of [-9, 9]) {{
+        const values = Array.from({{ length: rows }}, (_, k) => Math.sin(k / 50));
+        if (peak > 0) values[peak - 1] = NaN;
+        if (peak + 1 < rows) values[peak + 1] = height > 0 ? Infinity : -Infinity;
+        values[peak] = height;
+        const drawn = extremes(rows, 100, (row) => values[row]);
+        const sorted = drawn.every((x, k) => !k || x > drawn[k - 1]);
+        found.push([drawn.includes(peak), drawn[0], drawn.at(-1), drawn.length, sorted]);
+      }}
+    }}
+    console.log(JSON.stringify(found));
+    """
+    done = subprocess.run(["node", "--input-type=module", "-e", code], capture_output=True, text=True, check=True)
+    for has_peak, first, last, count, is_sorted in json.loads(done.stdout):
+        assert (has_peak, first, last, is_sorted) == (True, 0, rows - 1, True)
+        assert count <= 400 and (count == rows or rows > 400)
 
 
 @pytest.mark.parametrize(

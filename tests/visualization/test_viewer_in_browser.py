@@ -264,3 +264,17 @@ def test_the_curve_of_an_untrained_policy_is_a_point(record):
         tab.open(live.url)
         assert tab.run("[...document.querySelectorAll('#curve circle')].map((x) => x.getAttribute('cx'))") == ["6"]
         assert tab.problems == []
+
+
+def test_plots_of_a_long_flight_show_a_peak_of_one_row(record, tmp_path):
+    rows = 30_011
+    row = np.minimum(np.arange(rows), len(record.t) - 1)
+    names = ("pos", "quat", "vel", "omega", "rpm", "target_pos", "target_vel")
+    arrays = {name: getattr(record, name)[row] for name in names}
+    arrays["rpm"][12_345, 0, 2] = 50_000.0
+    long = dataclasses.replace(record, t=np.arange(1, rows + 1) / 100, load_pos=np.asarray(np.nan), **arrays)
+    with browser.open_tab() as tab:
+        tab.open(show(long).save(tmp_path / "long.html"))
+        plots = "jaxdrones.player.plots.flatMap((plot) => plot.curves(500))"
+        assert tab.run(f"Math.max(...{plots}.flatMap((curve) => curve.y))") == pytest.approx(50_000, rel=1e-3)
+        assert tab.problems == []

@@ -1,5 +1,6 @@
 // Plots of chosen signals, linked to the time line.
 
+import { extremes } from "./extremes.js";
 import { legible, theme } from "./theme.js";
 
 const LINES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"].map(legible);
@@ -146,10 +147,11 @@ export class Plot {
 
   /** The drone that is looked at with its target or parts, above thin lines of the others. */
   curves(width) {
-    const { world, drone } = this, signal = SIGNALS[this.select.value], every = Math.max(1, Math.floor(world.rows / (2 * width)));
-    const rows = Array.from({ length: Math.ceil(world.rows / every) }, (_, k) => k * every);
-    const t = rows.map((row) => world.t[row]);
-    const curve = (value, look) => ({ t, y: rows.map(value), ...look });
+    const { world, drone } = this, signal = SIGNALS[this.select.value];
+    const curve = (value, look) => {
+      const rows = extremes(world.rows, width, value);
+      return { t: rows.map((row) => world.t[row]), y: rows.map(value), ...look };
+    };
     if (signal.parts) return signal.parts.map((_, k) => curve((row) => signal.value(world, row, drone, k), { color: LINES[k], wide: true }));
     const others = world.labels.map((_, i) => i).filter((i) => i !== drone).slice(0, MOST);
     const found = others.map((i) => curve((row) => signal.value(world, row, i), { color: this.colors(i) }));

@@ -14,7 +14,7 @@ from jaxdrones.control import firmware_loops as loops
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import Gains, Memory
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -139,7 +139,7 @@ def reset(memory: Memory) -> Memory:
 
 @checked
 def control(
-    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: AnySetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: AnySetpoint, *, dt: Seconds
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
@@ -154,7 +154,7 @@ def control(
 
 @checked
 def pwm(
-    gains: Gains,
+    gains: Finite[Gains],
     memory: Memory,
     state: OneState,
     setpoint: AnySetpoint,

@@ -9,7 +9,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.arguments import Seconds, checked
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
 
 
@@ -42,7 +42,7 @@ def init() -> None:
 
 @checked
 def control(
-    gains: Gains, params: OneParams, memory: Any, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Any, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
 ) -> tuple[Any, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
 

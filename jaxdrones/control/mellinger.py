@@ -15,7 +15,7 @@ from jaxdrones.control import attitude
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import degrees, low_pass, settled
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -115,7 +115,7 @@ def init() -> Memory:
 
 @checked
 def control(
-    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
@@ -127,7 +127,7 @@ def control(
 
 @checked
 def pwm(
-    gains: Gains,
+    gains: Finite[Gains],
     memory: Memory,
     state: OneState,
     setpoint: OneSetpoint,

@@ -16,7 +16,7 @@ from jaxdrones.arguments import Seconds, checked
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -118,7 +118,7 @@ def init() -> Memory:
 
 @checked
 def control(
-    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 

@@ -9,7 +9,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.arguments import checked
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -56,7 +56,7 @@ def control(
 
 @checked
 def command(
-    gains: Gains, params: OneParams, state: OneState, setpoint: OneSetpoint
+    gains: Finite[Gains], params: OneParams, state: OneState, setpoint: OneSetpoint
 ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """Outer loop: collective thrust per mass (m/s^2, body z) and body rates (rad/s) towards a setpoint."""
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
@@ -74,8 +74,9 @@ def command(
     return collective, 2 * gains.attitude * error[:3] * turn
 
 
+@checked
 def follow(
-    gains: Gains, params: Params, state: State, collective: Float[Array, ""], omega: Float[Array, "3"]
+    gains: Finite[Gains], params: Params, state: State, collective: Float[Array, ""], omega: Float[Array, "3"]
 ) -> Float[Array, "4"]:
     """Inner loop: rotor speeds (RPM, up to `max_rpm`) for a collective thrust per mass and body rates."""
     gyroscopic = vector.cross(state.omega, params.inertia * state.omega)

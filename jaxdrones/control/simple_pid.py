@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation, vector
 from jaxdrones.arguments import Seconds, checked
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.single import OneParams, OneSetpoint, OneState
+from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import atan2, safe_sqrt
 
@@ -65,7 +65,7 @@ def init() -> Memory:
 
 @checked
 def control(
-    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm` (unlimited in gym-pybullet-drones).
 

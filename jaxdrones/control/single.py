@@ -1,11 +1,12 @@
 """Checks that reject a team where one drone is expected (it would broadcast), and the memory of a team."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_finite, check_shape, is_concrete
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -24,6 +25,16 @@ def _of_one_drone(name: str, value: Any) -> None:
             check_shape(f"{name}.{field}", getattr(value, field), shape, meaning)
 
 
+def _finite(name: str, gains: Any) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gains):
+        field = jax.tree_util.keystr(path)
+        is_limit = field.startswith(".max_") and is_concrete(leaf)
+        check_finite(f"{name}{field}", np.where(np.isposinf(leaf), 0, leaf) if is_limit else leaf)
+
+
+_T = TypeVar("_T")
+Finite = Annotated[_T, _finite]
+"""Gains of finite numbers; limits, `max_...`, may be infinite."""
 OneParams = Annotated[Params, _of_one_drone]
 OneState = Annotated[State, _of_one_drone]
 OneSetpoint = Annotated[Setpoint, _of_one_drone]

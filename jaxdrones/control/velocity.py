@@ -9,7 +9,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.arguments import Seconds, checked, shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import OneParams, OneState
+from jaxdrones.control.single import Finite, OneParams, OneState
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -19,7 +19,7 @@ _OF_ONE = shape(4, meaning="direction and magnitude of one drone; use jax.vmap f
 
 @checked
 def control(
-    gains: pid.Gains,
+    gains: Finite[pid.Gains],
     params: OneParams,
     memory: pid.Memory,
     state: OneState,

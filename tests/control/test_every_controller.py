@@ -1,5 +1,6 @@
 """What holds for all controllers, on every vehicle that they fit."""
 
+import re
 from collections.abc import Callable
 from functools import partial
 from itertools import product
@@ -169,6 +170,39 @@ def test_a_time_between_calls_that_is_not_positive_is_refused(loop):
     arguments = (one(x, 0) for x in (team, memory, state, target))
     with pytest.raises(ValueError, match=r"^dt is 0; give a positive number \(s\)$"):
         loop.control(loop.gains(), *arguments, dt=0)
+
+
+@each_controller
+def test_gains_that_are_not_finite_are_refused_and_infinite_limits_are_not(loop):
+    team, memory, state, target = in_flight(loop)
+    arguments = [one(x, 0) for x in (team, memory, state, target)]
+    gains = loop.gains()
+    for path, _ in jax.tree_util.tree_leaves_with_path(gains):
+        name = jax.tree_util.keystr(path)
+        for number in (jnp.nan, jnp.inf, -jnp.inf):
+            if not (name.startswith(".max_") and number == jnp.inf):
+                with pytest.raises(
+                    ValueError, match=rf"^gains{re.escape(name)} is not finite: .*; give finite numbers$"
+                ):
+                    loop.control(with_last(gains, name, number), *arguments, dt=DT)
+    unlimited = with_last(gains, ".max_", jnp.inf)
+    assert_finite(loop.control(unlimited, *arguments, dt=DT))
+
+
+def with_last(gains, name, number):
+    """Gains with this last number where the name begins so."""
+    return jax.tree_util.tree_map_with_path(
+        lambda path, x: x.at[(-1,) * x.ndim].set(number) if jax.tree_util.keystr(path).startswith(name) else x, gains
+    )
+
+
+def test_the_inner_loop_refuses_gains_that_are_not_finite():
+    team, _, state, _ = in_flight(RATES[0])
+    gains = rates.gains().replace(rate=jnp.array([40, 40, jnp.inf]))
+    with pytest.raises(ValueError, match=r"^gains\.rate is not finite"):
+        rates.follow(gains, one(team, 0), one(state, 0), jnp.array(9.8), jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"^gains\.rate is not finite"):
+        jax.vmap(partial(rates.follow, gains))(team, state, jnp.full(N, 9.8), jnp.zeros((N, 3)))
 
 
 @each_controller

@@ -10,6 +10,7 @@ from jaxdrones.params import Params
 from jaxdrones.vector import components, dot, largest, safe_sqrt
 
 _MIN_SHARE = 0.01  # smallest significant share of a rotor in thrust or yaw; usually each rotor has 0.25
+_MOST_LIFT = 400.0  # largest demanded thrust over that of one rotor at `max_rpm`; all larger ones are as infeasible
 _OTHERS = tuple(tuple(j for j in range(4) if j != i) for i in range(4))  # the other rotors of each one
 
 
@@ -35,9 +36,11 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     roll, pitch, yaw = components(torque)
     yaws = params.km > 0  # otherwise no rotor speeds produce a yaw torque, and its demand is ignored
     yaw = jnp.where(yaws, yaw / jnp.where(yaws, params.km, 1), 0)
-    target = jnp.stack([thrust / params.kf, roll / (params.kf * arm), pitch / (params.kf * arm), yaw])
+    limit = _square_of_limit(params)
+    lift = jnp.minimum(thrust / params.kf, _MOST_LIFT * limit)  # beyond it the difference from the limit is rounded
+    target = jnp.stack([lift, roll / (params.kf * arm), pitch / (params.kf * arm), yaw])
     inverses = _inverses(jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin], axis=-1))
-    inverse, limit = jnp.stack([rows[-1] for rows in inverses]), _square_of_limit(params)
+    inverse = jnp.stack([rows[-1] for rows in inverses])
     target = _within_authority(inverse, target, limit)
     squares = _non_negative_least_squares(inverses, target)
     squares = squares - _excess(squares, limit, inverse[:, 0]) * inverse[:, 0]

@@ -4,7 +4,7 @@ Each module has `settings(step, ...)`, `init(settings, params, state)` (of `mppi
 `control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all for one drone. `step` is that of a
 team over one control period: that of the simulation, or a simpler one. `setpoints` holds the target at the current and
 the next `settings.horizon` control steps, `memory` is that of `init` or the last call, and `dt` the time between calls,
-s. Use `jax.vmap` for teams and worlds. Without a new plan, `on_failure="hold"` of the planners repeats the last safe
+s. Use `jax.vmap` for teams and worlds. Without a new command, `on_failure="hold"` repeats the last safe
 command, and `"raise"`, which is impossible inside `jax.jit`, raises `PlanningError`; the memory has the status.
 
 `tune` tunes the gains of the controllers of `jaxdrones.control` for a vehicle. `twin.casadi_model` converts the physics

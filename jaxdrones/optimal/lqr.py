@@ -12,10 +12,11 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Weights, check_plan, checked_weights, hover, reference
+from jaxdrones.optimal.problem import Weights, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+from jaxdrones.status import OnFailure, Status, is_finite, raise_unless_ok, status_of
 
 _DOUBLINGS = 20  # a million control steps
 
@@ -37,6 +38,10 @@ class Memory(PyTreeNode):
     """(4, d) K of u = -K z, z a `tracking_error`."""
     value: Array
     """(d, d) P of the cost to go, z P z / 2."""
+    rpm: Array
+    """(4,) last command, RPM."""
+    status: Array
+    """() `Status` of the last command."""
 
 
 def settings(step: Any, weights: Weights | None = None) -> Settings:
@@ -50,20 +55,29 @@ def init(settings: Settings, params: Params, state: State) -> Memory:
     a, b = linearize_step(single(settings.step), params, at_rest, at_rest.rpm)
     q, r = settings.weights.state_matrix(len(a)), settings.weights.command_matrix()
     value = riccati(a, b, q, r)
-    return Memory(gain(a, b, r, value), value)
+    always = jnp.ones((), bool)
+    return Memory(gain(a, b, r, value), value, at_rest.rpm, status_of(always, always))
 
 
 @checked
 def control(
-    settings: Settings, params: OneParams, memory: Memory, state: OneState, setpoints: Setpoint, *, dt: float
+    settings: Settings,
+    params: OneParams,
+    memory: Memory,
+    state: OneState,
+    setpoints: Setpoint,
+    *,
+    dt: float,
+    on_failure: OnFailure = "hold",
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`.
-
-    There is no plan and no status: the rotor speeds for a state that is not finite are not finite.
-    """
-    check_plan(settings.horizon, setpoints, settings.step, dt)
-    target = reference(params, setpoints, state.aux, dt)
-    return memory, feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`."""
+    valid, state, target = posed(settings, params, memory, state, setpoints, dt, on_failure)
+    rpm = feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])
+    status = status_of(valid, is_finite(rpm))
+    command = jnp.where(status == Status.OK, rpm, memory.rpm)
+    if on_failure == "raise":
+        raise_unless_ok(status, "lqr")
+    return memory.replace(rpm=command, status=status), command
 
 
 def feedback(

@@ -25,6 +25,7 @@ Horizon = Annotated[int, whole(minimum=2)]
 """Control steps of a plan; two have an angular acceleration of the reference."""
 
 _SMALL = 1e-3  # thrust over weight, or angle between thrust and heading, rad, below which an attitude is undefined
+_LIFT = 1e-6  # least vertical force over a thrust along the heading, to compute the limit
 
 
 class Weights(PyTreeNode):
@@ -116,8 +117,10 @@ def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> t
     aside = cross(unit(force), jnp.stack([cos, sin, jnp.zeros_like(yaw)]))
     least = _SMALL * params.mass * params.gravity
     undefined = (dot(force, force) < least**2) | (dot(aside, aside) < _SMALL**2)
-    axes = attitude.from_thrust(force + along_z(jnp.where(undefined, least, 0)), yaw)
-    return rotation.from_matrix(jnp.stack(axes, axis=-1)), safe_sqrt(dot(force, force))
+    thrust = safe_sqrt(dot(force, force))
+    lift = jnp.maximum(least, _LIFT * thrust)
+    axes = attitude.from_thrust(force + along_z(jnp.where(undefined, lift, 0)), yaw)
+    return rotation.from_matrix(jnp.stack(axes, axis=-1)), thrust
 
 
 def _with_last(x: Float[Array, "k 3"], times: int = 1) -> Float[Array, "_ 3"]:
@@ -144,7 +147,8 @@ def posed(
         ValueError: a wrong time between calls, number of setpoints, or `on_failure` for these arguments.
     """
     check_plan(settings.horizon, setpoints, settings.step, dt, on_failure, (params, memory, state))
-    valid = is_finite((state, setpoints))
+    squares = jax.vmap(lambda acc: jnp.sum((params.mass * (acc + along_z(params.gravity))) ** 2))(setpoints.acc)
+    valid = is_finite((state, setpoints, squares))  # an attitude needs the square of its force
     rest = hover(params, state)
     rest = rest.replace(aux=jax.tree.map(jnp.zeros_like, rest.aux))
     zero = jax.tree.map(jnp.zeros_like, setpoints)

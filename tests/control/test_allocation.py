@@ -189,6 +189,19 @@ def test_too_much_roll_and_pitch_keep_their_direction(vehicle):
     np.testing.assert_allclose(jnp.min(rpm, axis=1) / params.max_rpm, 0, atol=1e-7)
 
 
+@pytest.mark.float32
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_a_demand_of_thrust_far_beyond_reach_is_full_thrust_with_roll_and_pitch(vehicle):
+    """In single precision the difference between demand and limit was lost, and the rotors stood still."""
+    params = jaxdrones.load_params(vehicle)
+    torque = jnp.array([0.05, -0.02, 0.3]) * params.max_xy_torque
+    thrusts = params.max_thrust * 10.0 ** jnp.arange(3, 30)
+    rpm = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, None)))(params, thrusts, torque)
+    expected = rpm_from_wrench(params, 2 * params.max_thrust, torque)
+    assert jnp.max(expected) == params.max_rpm
+    np.testing.assert_allclose(rpm, np.broadcast_to(expected, rpm.shape), rtol=1e-4)  # roundings of 100 times the limit
+
+
 def test_nothing_is_asked_of_rotors_that_should_pull():
     params = jaxdrones.load_params("cf2x")
     np.testing.assert_array_equal(allocate_all(params, jnp.full(N, -params.weight), jnp.zeros((N, 3))), 0)

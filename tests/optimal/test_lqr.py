@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 from closed_loop import hovering, make_step, one, team_of
-from helpers import VEHICLES, flying
+from helpers import VEHICLES, flying, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones import optimal
 from jaxdrones.control import Setpoint
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.problem import hover
+from jaxdrones.status import PlanningError, Status
 
 DT = 1 / 100
 
@@ -91,6 +92,48 @@ def test_the_command_does_not_depend_on_the_heading():
     target = Setpoint.at(rotate(target.pos), rotate(target.vel), rotate(target.acc), target.yaw + 1.1)
     _, again = lqr.control(settings, params, memory, turned, target, dt=DT)
     np.testing.assert_allclose(again, rpm, rtol=1e-9)
+
+
+@pytest.mark.float32
+def test_a_reference_of_any_acceleration_has_a_command_within_limits_or_a_status():
+    params, state = some_state()
+    state = hover(params, state)
+    settings = lqr.settings(jd.make_step(dt=DT))
+    gain = 0.1 * jnp.asarray(np.random.default_rng(0).normal(size=(4, 16)), jnp.float32)
+    memory = lqr.Memory(gain.at[:, 12:].set(0), jnp.zeros((16, 16)), jnp.full(4, 123.0), jnp.zeros((), jnp.int32))
+
+    @jit_unoptimized
+    @jax.vmap
+    def control(acc):
+        return lqr.control(settings, params, memory, state, Setpoint.at(jnp.zeros((3, 3)), acc=acc), dt=DT)
+
+    powers = 10.0 ** np.arange(3, 39)
+    for direction in ([0, 0, 1], [1, 0, 0], [-1, 0, 0], [0.3, -0.2, 0.1]):
+        acc = powers[:, None, None] * np.array(direction) * np.ones((3, 1))
+        after, rpm = control(jnp.asarray(acc, jnp.float32))
+        in_range = powers < 1e20  # the square of its force has a float32
+        assert np.all(after.status[in_range] == Status.OK) and np.all(after.status[powers > 1e22] != Status.OK)
+        assert np.all((rpm >= 0) & (rpm <= params.max_rpm)) and np.array_equal(after.rpm, rpm)
+        np.testing.assert_allclose(rpm[in_range], np.broadcast_to(rpm[2], rpm[in_range].shape), rtol=0, atol=100)
+        assert np.all(rpm[powers > 1e22] == 123)
+        assert direction != [0, 0, 1] or np.all(rpm[in_range] > 0.9999 * params.max_rpm)
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+def test_a_state_that_is_not_finite_has_the_last_safe_command_and_a_status_or_an_error():
+    params, state = some_state()
+    settings = lqr.settings(jd.make_step(dt=DT))
+    memory = jit_unoptimized(lqr.init)(settings, params, state)
+    near = Setpoint.at(jnp.zeros((3, 3)))
+    before, safe = lqr.control(settings, params, memory, state, near, dt=DT)
+    lost = state.replace(omega=state.omega.at[1].set(jnp.nan))
+    for unlucky, target in (lost, near), (state, near.replace(yaw=jnp.full(3, jnp.inf))):
+        after, rpm = lqr.control(settings, params, before, unlucky, target, dt=DT)
+        assert after.status == Status.INVALID_STATE and np.array_equal(rpm, safe)
+        assert lqr.control(settings, params, after, state, near, dt=DT)[0].status == Status.OK
+    with pytest.raises(PlanningError, match="lqr: The state or a set-point is not finite"):
+        lqr.control(settings, params, before, lost, near, dt=DT, on_failure="raise")
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from jaxdrones.flights import parameters
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, normal_equations, standard_errors
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.flights.open_loop import HORIZONS, cut_windows, hold_errors, open_loop_errors, window_starts
-from jaxdrones.flights.path_fit import fit_path, padded
+from jaxdrones.flights.path_fit import BALANCE_PARAMETERS, PATH_PARAMETERS, fit_path, padded
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
@@ -127,6 +127,7 @@ def _fit_paths(
         raise UserError(
             "flights on set-points are fitted without validation; leave --validate out, or name --parameters"
         )
+    parameters.check_guess(Vehicle.of(params), (*BALANCE_PARAMETERS, *PATH_PARAMETERS))
     vehicle, errors = fit_path(logs, Vehicle.of(params), motors, gains, progress)
     estimates = {name: _estimate(vehicle, name, error) for name, error in errors.items()}
     return Report(vehicle, estimates, {}, (), {log.name: open_loop_errors(log, vehicle, motors) for log in logs})

@@ -258,3 +258,5 @@ def test_a_parameter_of_which_there_is_nothing_to_multiply_is_refused():
     still = params.replace(rotor_rise_time=jnp.zeros(()), drag_coeff=jnp.zeros(3))
     with pytest.raises(ValueError, match=r"the vehicle has a rotor_lag of 0, .* with a first guess"):
         check_guess(Vehicle.of(still), ["drag_coeff_x", "rotor_lag"])
+    with pytest.raises(ValueError, match=r"the vehicle has a rotor_lag of 0, .* with a first guess"):
+        fit(load_flights(NANOBENCH), still)

@@ -56,7 +56,7 @@ def load(path: str | os.PathLike, network: Any = None) -> Policy:
             if network is None:
                 raise UserError(f"{path} holds a network of your own, {settings['own']}; give load(path, network=...)")
             network = OwnNetwork(network, settings["output_size"])
-            params = network.restored(params, sidecar["policy"]["per_agent"])
+            params = network.restored(params, len(obs_stats.mean), sidecar["policy"]["per_agent"])
         else:
             network = Network(**settings) if "recurrent_size" in settings else MLP(**settings)
         policy = Policy(params, obs_stats, network, sidecar["policy"]["per_agent"])

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Protocol, cast, runtime_checkable
 
+import flax.errors
 import flax.linen as nn
 import flax.struct
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function
-from jaxdrones.checks import is_concrete, short_repr
+from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -82,24 +83,30 @@ class OwnNetwork:
             return self.module.init(key, *state, example)
         return tuple(jnp.asarray(x) for x in self._leaves if _is_trained(x))
 
-    def restored(self, params: dict[str, Any], per_agent: bool = False) -> Any:
+    def restored(self, params: Any, observation_size: int, per_agent: bool = False) -> Any:
         """Parameters from a file, where tuples are dictionaries, possibly a set for each drone.
 
         Raises:
-            ValueError: arrays of other shapes than those of an nnx or equinox module.
+            ValueError: arrays of other shapes than those of the module; of a linen module of images, when it is called.
         """
         if isinstance(self.module, nn.Module):
-            return params
-        arrays = tuple(params[str(i)] for i in range(len(params)))
-        found, own = ([np.shape(x) for x in xs] for xs in (arrays, filter(_is_trained, self._leaves)))
-        if [shape[per_agent:] for shape in found] != own:
-            raise UserError(f"network has arrays {short_repr(own)}, the policy {short_repr(found)}; give its network")
-        return arrays
+            try:
+                module = jax.eval_shape(lambda: self.init(jax.random.key(0), jnp.zeros(observation_size)))
+            except Exception:  # of the user's code, for images
+                return params
+        else:
+            module = tuple(filter(_is_trained, self._leaves))
+            params = tuple(params[str(i)] for i in range(len(params)))
+        own, found = _shapes(module), _shapes(params, per_agent)
+        for name in own | found:
+            if (here := own.get(name, "none")) != (there := found.get(name, "none")):
+                raise UserError(f"network has array {name} of shape {here}, the policy {there}; give its network")
+        return params
 
     def with_params(self, params: Any) -> Callable:
         """Module with other parameters; for linen a function that applies it."""
         if isinstance(self.module, nn.Module):
-            return functools.partial(self.module.apply, params)
+            return functools.partial(_apply, self.module, params)
         rest = iter(params)
         return jax.tree.unflatten(self._structure, [next(rest) if _is_trained(x) else x for x in self._leaves])
 
@@ -121,6 +128,19 @@ class OwnNetwork:
         for _ in range(state_vector(obs).ndim - 1):
             one_drone = jax.vmap(one_drone)
         return one_drone(hidden_state, obs)
+
+
+def _shapes(tree: Any, per_agent: bool = False) -> dict[str, tuple[int, ...]]:
+    named = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path): np.shape(x)[int(per_agent) :] for path, x in named}
+
+
+def _apply(module: nn.Module, params: Any, *args: Any) -> Any:
+    """Output of a linen module with parameters that may be those of another one."""
+    try:
+        return module.apply(params, *args)
+    except (flax.errors.ScopeParamNotFoundError, flax.errors.ScopeParamShapeError) as error:
+        raise UserError(f"the policy's parameters are not those of network: {error}; give its network") from error
 
 
 def _is_trained(leaf: Any) -> bool:

@@ -16,7 +16,7 @@ from flax import nnx
 from helpers import jit_unoptimized, mostly_slow, name_of
 
 from jaxdrones.learning import bptt, checkpoint, loggers, ppo
-from jaxdrones.learning.networks import MLP, Policy
+from jaxdrones.learning.networks import MLP, OwnNetwork, Policy
 
 KEY = jax.random.key(0)
 SIZES = (2, 8, 1)
@@ -262,5 +262,40 @@ def test_a_policy_is_not_loaded_into_a_network_of_other_arrays(tmp_path):
     checkpoint.save(tmp_path / "policy", policy)
     assert checkpoint.load(tmp_path / "policy", network(*SIZES)).per_agent
     for sizes in (2, 8), (2, 4, 1), (2, 8, 8, 1):
-        with pytest.raises(ValueError, match=r"network has arrays .*, the policy \[.*; give its network"):
+        with pytest.raises(ValueError, match=r"network has array \[\d\] of shape .*, the policy .*; give its network"):
             checkpoint.load(tmp_path / "policy", network(*sizes))
+
+
+class Wide(nn.Module):
+    width: int
+    layers: int = 1
+
+    @nn.compact
+    def __call__(self, obs):
+        x = obs["depth"].reshape(-1) if isinstance(obs, dict) else obs
+        for _ in range(self.layers):
+            x = nn.tanh(nn.Dense(self.width)(x))
+        return nn.Dense(1, name="head")(x)
+
+
+@pytest.mark.parametrize("per_agent", [False, True])
+def test_a_policy_is_not_loaded_into_a_linen_network_of_another_width_or_depth(per_agent, tmp_path):
+    """More layers were not missed, and another width ended in a traceback of flax at the first call."""
+    policy = Policy.init(KEY, DoubleIntegrator(), network=Wide(8, 2), per_agent=per_agent)
+    checkpoint.save(tmp_path / "policy", policy)
+    loaded = checkpoint.load(tmp_path / "policy", Wide(8, 2))
+    np.testing.assert_array_equal(loaded(jnp.ones((1, 2))), policy(jnp.ones((1, 2))))
+    for network in Wide(9, 2), Wide(8, 1), Wide(8, 3):
+        with pytest.raises(
+            ValueError,
+            match=r"network has array \['params'\]\['Dense_\d'\].* of shape .*, the policy .*; give its network",
+        ):
+            checkpoint.load(tmp_path / "policy", network)
+
+
+def test_a_network_of_images_names_its_fault_at_the_first_call():
+    network = OwnNetwork(Wide(8), 1)
+    params = network.init(KEY, {"depth": jnp.ones((2, 3))})
+    network.apply(params, {"state": jnp.ones(2), "depth": jnp.ones((2, 3))})
+    with pytest.raises(ValueError, match=r"the policy's parameters are not those of network: .*; give its network"):
+        OwnNetwork(Wide(9), 1).apply(params, {"state": jnp.ones(2), "depth": jnp.ones((2, 3))})

@@ -55,7 +55,7 @@ def save(
         env: environment of the policy, which describes its inputs and outputs.
         to: `c`, `onnx`, `stablehlo` or `js`.
         folder: folder of the files; it is created.
-        name: name of the files, and prefix of the names in C.
+        name: name of the files, and prefix of the names in C, where it has no capital letters.
         title: origin of the policy, for the descriptions; by default the name of the task.
 
     Returns:
@@ -68,6 +68,10 @@ def save(
     """
     if not (name.isidentifier() and name.isascii() and name[0] != "_"):
         raise UserError(f"name is {name!r}; give a letter, then letters, digits and underscores")
+    if to == "c" and name != name.lower():
+        raise UserError(
+            f"name is {name!r}; give lower case letters, as names that differ in case have the same macros in C"
+        )
     if not isinstance(policy, Policy):
         raise UserError(
             f"the policy is {short_repr(policy)}; give one of jaxdrones.learning (Policy), because the layers of a "

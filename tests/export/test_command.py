@@ -177,9 +177,24 @@ def test_what_cannot_be_exported_is_said(env, tmp_path):
         save(policy, env, "rust", tmp_path)
     with pytest.raises(ValueError, match="name is '2fast'; give a letter"):
         save(policy, env, "c", tmp_path, name="2fast")
+    with pytest.raises(ValueError, match="name is 'Policy'; give lower case letters, as names that differ in case"):
+        save(policy, env, "c", tmp_path, name="Policy")
     with pytest.raises(ValueError, match=r"policy have \(22, 4\) numbers, those of leader-follower \(12, 1\)"):
         save(policy, jd.make("leader-follower"), "c", tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed")
+def test_headers_of_two_names_are_used_together_and_other_targets_have_capital_letters(env, tmp_path):
+    policy = exported.random_policy(env)
+    for name in ("hover", "hover_", "h"):
+        save(policy, env, "c", tmp_path, name=name)
+    save(policy, env, "js", tmp_path, name="Hover")
+    code = "".join(f'#include "{name}.h"\n' for name in ("hover", "hover_", "h"))
+    calls = "".join(f"{name}_step(obs, act);" for name in ("hover", "hover_", "h"))
+    code += f"int main(void) {{ float obs[HOVER_OBS_SIZE] = {{0}}, act[H_ACT_SIZE]; {calls} return 0; }}"
+    (tmp_path / "main.c").write_text(code)
+    subprocess.run(["cc", "-std=c99", "-Werror", "main.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
 
 
 def damaged(run: Path, folder: Path, file: str, content: bytes | None) -> Path:

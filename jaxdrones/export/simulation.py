@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -148,17 +149,21 @@ def _check(policy: Policy, env: Env) -> None:
 
 
 def _target_moves(env: Env, key: jax.Array) -> Array:
-    """Whether the target of a task depends on time, or is another one after a drone has flown through it."""
+    """Whether the target of a task depends on time, or is another one after a drone has flown to it or through it."""
     _, world = env.reset(key)
     first = env.task.target_now(world).pos
-    places = [env.task.target_now(world.replace(step=world.step + steps)).pos for steps in (1, env.steps // 2)]
-    for sign, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)):
+
+    def at(steps: Array) -> Array:
+        return env.task.target_now(world.replace(step=world.step + steps)).pos
+
+    places = [jax.vmap(at)(jnp.arange(1, env.steps + 1))]
+    for sign, axis in [(0, 0), *itertools.product((1, -1), range(3))]:
         direction, flown = jnp.zeros_like(first).at[:, axis].set(sign), world
         for pos in (first - direction, first + direction):
             flown = flown.replace(drones=flown.drones.replace(pos=pos))
             flown = flown.replace(variables=env.task.advance(env.task, flown))
-        places.append(env.task.target_now(flown).pos)
-    return jnp.any(jnp.stack(places) != first[None])
+            places.append(env.task.target_now(flown).pos[None])
+    return jnp.any(jnp.concatenate(places) != first[None])
 
 
 def _numbers(tree: Any) -> list[float]:

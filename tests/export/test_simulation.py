@@ -269,6 +269,34 @@ def test_a_page_of_a_task_that_it_does_not_simulate_is_refused(task, reason):
         _check(lambda obs: jnp.zeros((1, 4)), jd.make(task))
 
 
+@pytest.mark.parametrize("case", ["still", "touched", *[(axis, sign) for axis in range(3) for sign in (1, -1)], 4.9])
+def test_a_target_that_changes_when_it_is_passed_in_any_direction_or_late_is_not_simulated(case):
+    from jaxdrones.export.simulation import _target_moves
+
+    hover = jd.make("hover").task
+    zero = jnp.zeros((1,), bool)
+
+    def start(key, params):
+        return hover.start(key, params)[0], {"behind": zero, "passed": zero, "place": jnp.array([[0.0, 0, 1]])}
+
+    def target(variables, time):
+        late = jnp.where(time > case, 0.1, 0.0) if isinstance(case, float) else 0.0
+        return jd.control.Setpoint.at(variables["place"] + late + 0.3 * variables["passed"][:, None])
+
+    def advance(task, world):
+        away = world.drones.pos - world.variables["place"]
+        if case == "touched":
+            return world.variables | {"passed": world.variables["passed"] | (jnp.max(jnp.abs(away)) < 0.05)}
+        if not isinstance(case, tuple):
+            return world.variables
+        now = case[1] * away[:, case[0]]
+        passed = world.variables["passed"] | (world.variables["behind"] & (now > 0))
+        return world.variables | {"behind": now < 0, "passed": passed}
+
+    task = dataclasses.replace(hover, start=start, target=target, advance=advance)
+    assert bool(_target_moves(jd.make(task), jax.random.key(0))) == (case != "still")
+
+
 def test_the_policy_of_a_page_flies_without_the_disturbance_of_its_environment(env, monkeypatch):
     """Its draws need a random key, which the page has not."""
     from jaxdrones.export import simulation

@@ -207,6 +207,8 @@ def test_plots_of_long_flights_show_every_short_peak(rows):
         (lambda path: path, {"params": "team", "dt": -1.0}, "dt"),
         (lambda path: path, {"params": "one", "dt": 0.01}, r"params are of a team of shape \(\)"),
         (lambda path: path, {"params": "team", "dt": 0.01, "targets": np.zeros((2, 3))}, "targets have shape"),
+        (lambda path: path, {"params": "team", "dt": 0.01, "targets": np.inf}, "targets are not finite"),
+        (lambda path: path, {"params": "team", "dt": 0.01, "targets": -1e300}, "too large for float32"),
         (lambda path: path, {"params": "team", "dt": 0.01, "labels": ["a"]}, "labels are 1 names"),
         (lambda path: path, {"params": "team", "dt": 0.01, "others": "ghost"}, "did you mean 'ghosts'"),
         (lambda path: jax.tree.map(lambda x: x[0], path), {"params": "team", "dt": 0.01}, r"shape \(3, 3\)"),

@@ -77,9 +77,9 @@ def show(
     """
     of_trajectory = {"params": params, "dt": dt, "targets": targets, "labels": labels, "images": images}
     if targets is not None:
-        of_trajectory["targets"] = np.asarray(targets, float)
+        of_trajectory["targets"] = given = np.asarray(targets, float)
         with np.errstate(over="ignore"):
-            if np.isinf(np.float32(of_trajectory["targets"])).any():
+            if np.isinf(given.astype(np.float32)).any():
                 raise UserError("targets are not finite, or too large for float32; give places, or NaN for no target")
     worlds = _worlds(flight, of_trajectory)
     records = list(worlds.values())

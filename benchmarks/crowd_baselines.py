@@ -5,8 +5,6 @@ constraints: a quadratic program in three variables for every drone, solved by q
 learned policies.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ The vehicle is a Crazyflie (`cf2x`) with drag and a rotor lag of 55 ms; the publ
 used, because identifications of this value differ by a factor of five.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """RLlib `MultiAgentEnv` of a team, one agent per drone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stable-Baselines3 `VecEnv` of many worlds in one compiled step."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

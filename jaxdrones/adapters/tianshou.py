@@ -1,7 +1,5 @@
 """Tianshou vector environment of many worlds in one compiled step, for `Collector`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

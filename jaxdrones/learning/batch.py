@@ -1,7 +1,5 @@
 """Training data of PPO: transitions with advantages and value targets, in minibatches."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

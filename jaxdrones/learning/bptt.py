@@ -1,7 +1,5 @@
 """Backpropagation through time: gradients of the rewards through physics and policy (analytic policy gradient)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar

@@ -3,8 +3,6 @@
 Modified, truncated and mismatched files are rejected; see `learning.files`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from pathlib import Path

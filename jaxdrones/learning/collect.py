@@ -1,7 +1,5 @@
 """Collection of trajectories in many worlds with consecutive episodes."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

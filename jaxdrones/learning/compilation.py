@@ -1,7 +1,5 @@
 """Compilation of trainings and evaluations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

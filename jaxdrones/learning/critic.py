@@ -4,8 +4,6 @@ A critic is an MLP, with a CNN for images. It has no hidden state of its own and
 input, so it learns from single control steps in any order.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Evaluation of a policy over many episodes, with a confidence interval of its success rate."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Gaussian exploration."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ are rejected. After a crash between two renames, the sidecar decides which conte
 the new file beside it (`state.new.msgpack`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

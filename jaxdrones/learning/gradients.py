@@ -14,8 +14,6 @@ Each can include or exclude the gradient of camera images. That gradient is of t
 depth at the edges of obstacles.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

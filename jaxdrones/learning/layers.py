@@ -1,7 +1,5 @@
 """Network layers: multilayer perceptrons, convolutions of images, gated recurrent units."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

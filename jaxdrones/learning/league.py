@@ -4,8 +4,6 @@ The first drone of every team learns; the others are flown by past policies of t
 part of the training state. So a whole training is one compiled program.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

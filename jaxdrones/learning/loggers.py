@@ -3,8 +3,6 @@
 A logger is a function `(update, metrics, state)`, with the number of updates so far.
 """
 
-from __future__ import annotations
-
 import csv
 import importlib
 import math

@@ -1,7 +1,5 @@
 """Metrics of an update: rewards, errors, and returns of whole episodes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Bundled and published policies by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

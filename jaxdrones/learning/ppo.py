@@ -1,7 +1,5 @@
 """Proximal policy optimization (Schulman et al. 2017), for teams and many worlds."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

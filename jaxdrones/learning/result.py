@@ -1,7 +1,5 @@
 """Training loop, its state and result, and optimizers."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Discounted rewards, advantages and TD(lambda) targets of trajectories."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float

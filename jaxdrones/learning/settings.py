@@ -1,7 +1,5 @@
 """Common settings of the learners."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

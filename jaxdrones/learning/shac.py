@@ -1,7 +1,5 @@
 """Short-horizon actor-critic (Xu et al. 2022): backpropagation through short trajectories with a terminal value."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -12,8 +12,6 @@ A CPU is one device by default. Before the first use of JAX, set `jax.config.upd
 `XLA_FLAGS=--xla_force_host_platform_device_count=2` in the environment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

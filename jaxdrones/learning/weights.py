@@ -1,7 +1,5 @@
 """Policies from the weights of a multilayer perceptron of another library."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax.numpy as jnp

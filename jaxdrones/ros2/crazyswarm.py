@@ -8,8 +8,6 @@ Parameters of the server, all optional: `sim.jaxdrones.vehicle` (cf2x),
 The interface is that of Crazyswarm2's own backend `np`, read in its source; it has not been run inside Crazyswarm2.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Sequence
 from typing import Any

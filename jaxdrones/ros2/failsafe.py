@@ -1,7 +1,5 @@
 """Failsafe without commands."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Annotated
 

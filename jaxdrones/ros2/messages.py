@@ -4,8 +4,6 @@ Numbers are Python numbers, arrays of numbers tuples, and `uint8[]` is bytes. Fi
 identity. Needs the extra `ros2`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """ROS 2 node of a simulated team, in real time or in lockstep."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import time

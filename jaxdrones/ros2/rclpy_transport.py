@@ -1,7 +1,5 @@
 """Transport by rclpy, the Python library of ROS 2."""
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Callable, Iterator

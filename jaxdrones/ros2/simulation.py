@@ -1,7 +1,5 @@
 """Simulation of a commanded team: step, controllers and measurements."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

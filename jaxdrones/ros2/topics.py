@@ -4,8 +4,6 @@ Frames follow REP-103: `world` is east, north, up (the world frame of the simula
 up, and a camera's optical frame has x right, y down and z forward. Units are SI, except for rotor speeds in RPM.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol

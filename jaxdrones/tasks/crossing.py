@@ -1,7 +1,5 @@
 """Flight of every drone of a team to its goal without touching anything: shared by `crowd`, `swap-goals`, `room`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Task: a crowd of drones crosses a box without touching."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Reference curves: periodic shapes, and positions of a team over time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated
 

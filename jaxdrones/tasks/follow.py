@@ -1,7 +1,5 @@
 """Task: follow another drone and keep it in view."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping

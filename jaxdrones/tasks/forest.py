@@ -1,7 +1,5 @@
 """Task: fly through a forest to a goal on the other side, with a depth camera."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

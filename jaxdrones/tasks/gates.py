@@ -1,7 +1,5 @@
 """Task: race through gates on the track of lsy_drone_racing, nominal, randomized or random."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

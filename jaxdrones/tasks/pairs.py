@@ -1,7 +1,5 @@
 """Quantities of pairs of drones."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int

@@ -1,7 +1,5 @@
 """Tasks: fly loads on cables along a curve."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Task: a race of several drones around a track, in each other's downwash and with contact."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any
 

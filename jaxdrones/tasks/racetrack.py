@@ -1,7 +1,5 @@
 """Race tracks of four gates: scenes by level, and passages of gates; shared by `gates` and `race`."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Task: exchange places in a room with pillars."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated

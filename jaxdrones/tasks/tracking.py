@@ -1,7 +1,5 @@
 """Task: track a curve."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Task: cross below other drones and keep the altitude."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

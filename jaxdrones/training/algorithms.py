@@ -3,8 +3,6 @@
 It holds names of modules, so that the command line can list them without importing the learners.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Annotated, Any, Protocol, cast
 

@@ -1,7 +1,5 @@
 """Trained policy as a pilot of Betaflight."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training in several processes, called hosts, each with the same program on its own devices."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """One episode with a policy, on either backend, and its log."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

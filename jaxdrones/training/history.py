@@ -1,7 +1,5 @@
 """Flights of the policies in the history of a training, and its learning curve."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

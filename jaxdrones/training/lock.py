@@ -1,7 +1,5 @@
 """Lock of a folder against concurrent trainings."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Training loop of one seed: updates, progress, evaluations, checkpoints, and resumption."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import secrets

@@ -1,7 +1,5 @@
 """Schedule of evaluations, end of a training by updates, success rate or time, and choice of its best policy."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

@@ -1,7 +1,5 @@
 """Tuned settings by task and learner."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

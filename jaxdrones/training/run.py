@@ -10,8 +10,6 @@ Each checkpoint is a .msgpack file with a .json sidecar. All contain the id of t
 trainings in one folder are rejected.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses

@@ -1,7 +1,5 @@
 """Compiled programs of a recipe."""
 
-from __future__ import annotations
-
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

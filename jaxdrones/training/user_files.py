@@ -4,8 +4,6 @@ A recipe has their names without folders, and their text. A run is thus independ
 task is executed when its run is opened.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Headless Chromium, controlled by its debugging protocol through a pipe, without a port or a library."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Films by the JAX renderer, with shadows, trails, targets, names and a clock."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Generator

@@ -1,7 +1,5 @@
 """Overlays of a film: trails, targets, names, title and clock. Needs Pillow (extra `video`)."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

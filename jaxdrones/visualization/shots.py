@@ -1,7 +1,5 @@
 """Camera of a film: close to the whole team, with an unobstructed view."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

@@ -1,7 +1,5 @@
 """Forces of contact with the ground, with obstacles and with other drones, estimated from a log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

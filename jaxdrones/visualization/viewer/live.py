@@ -1,7 +1,5 @@
 """Live view of flights in the browser, streamed by a local server."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Viewer page as a file and in a notebook, and the page with a list of flights."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import html

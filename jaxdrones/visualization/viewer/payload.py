@@ -5,8 +5,6 @@ the header an array is `{"dtype", "offset", "shape", "low", "step"}`. Numbers wi
 int16: they count steps from `low`, and are stored as differences along the first axis, modulo 2^16.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import math

@@ -1,7 +1,5 @@
 """Local server of the live page, with a secret address."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import secrets

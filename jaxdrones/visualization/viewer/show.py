@@ -1,7 +1,5 @@
 """Viewer pages of trajectories, logs and episodes of one or many worlds, and of the policies of a training."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

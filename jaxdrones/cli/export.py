@@ -8,9 +8,7 @@ from jaxdrones.cli.options import add_drones, add_output, option, switch
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import given_settings
-from jaxdrones.export import save
-
-TARGETS = ("c", "onnx", "stablehlo", "js")
+from jaxdrones.export import TARGETS, save
 
 
 def add(commands) -> None:

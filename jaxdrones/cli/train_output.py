@@ -10,8 +10,8 @@ from typing import Any
 from jaxdrones.cli.common import bar, print_warning
 from jaxdrones.cli.report import as_json, evaluation_table, percent
 from jaxdrones.cli.train_request import Request
-from jaxdrones.learning.evaluation import wilson_interval
-from jaxdrones.training.plan import best_of, score_of
+from jaxdrones.learning.evaluation import score_of, wilson_interval
+from jaxdrones.training.plan import best_of
 from jaxdrones.training.run import Run
 from jaxdrones.visualization import learning_curves
 

@@ -1,6 +1,7 @@
 """Evaluation of a policy over many episodes, with a confidence interval of its success rate."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,6 +22,9 @@ from jaxdrones.pytree import PyTreeNode
 _CHUNK = 1000  # episodes simulated at a time
 _ROUNDING = 1e-4  # relative, and absolute in SI units: tolerance between repetitions of a flight
 _EPISODE_BYTES = 128  # memory of the results of an episode per drone
+
+Score = tuple[float, float]
+"""Success rate and mean return of an evaluation."""
 
 
 class Report(PyTreeNode):
@@ -245,3 +249,8 @@ def wilson_interval(successes: float, trials: int, z: float = 1.959964) -> tuple
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     low, high = (center - half) / (1 + z**2 / n), (center + half) / (1 + z**2 / n)
     return max(0.0, float(low)), min(1.0, float(high))
+
+
+def score_of(success: float | None, mean_return: float) -> Score:
+    """Score of an evaluation; missing success is 0, a return that is NaN is the worst."""
+    return success or 0.0, mean_return if math.isfinite(mean_return) else -math.inf

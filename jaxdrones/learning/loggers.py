@@ -5,7 +5,6 @@ A logger is a function `(update, metrics, state)`, with the number of updates so
 
 import csv
 import importlib
-import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from jaxdrones import writing
 from jaxdrones.arguments import Count, checked
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
-from jaxdrones.learning.evaluation import Report, compile_evaluation
+from jaxdrones.learning.evaluation import Report, Score, compile_evaluation, score_of
 from jaxdrones.learning.networks import Policy
 
 
@@ -103,6 +102,7 @@ class KeepBest:
         """Evaluate in `env` after `every` updates, in the same `episodes` of a random key for all policies."""
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
+        self._score: Score | None = None
 
     def __call__(self, update: int, metrics: dict[str, float], state: Any) -> None:
         """Evaluate the policy of a training state if an evaluation is due."""
@@ -111,8 +111,9 @@ class KeepBest:
         if self._evaluate is None:
             self._evaluate = compile_evaluation(self._env, state.policy, self._episodes)
         report = self._evaluate(state.policy, self._key)
-        if self.report is None or _score(report) > _score(self.report):
-            self.policy, self.report = state.policy, report
+        score = score_of(report.success, report.mean_return)
+        if self._score is None or score > self._score:
+            self.policy, self.report, self._score = state.policy, report, score
 
 
 _NAMED: dict[str, Callable[[Path], Any]] = {
@@ -134,11 +135,6 @@ def logger_names(names: str | None) -> list[str]:
 def named_loggers(names: str | None, folder: Path) -> list[Any]:
     """The loggers of a run, for names as of `logger_names`; `folder` is that of the run."""
     return [_NAMED[name](folder) for name in logger_names(names)]
-
-
-def _score(report: Report) -> tuple[float, float]:
-    """Success and return; a return that is not finite is the worst."""
-    return report.success or 0.0, report.mean_return if math.isfinite(report.mean_return) else -math.inf
 
 
 def _library(name: str) -> Any:

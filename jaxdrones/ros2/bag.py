@@ -45,7 +45,7 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
             raise UserError(f"{path} cannot be written: {error.strerror}; choose another") from None
 
     def __exit__(self, *_) -> None:
-        self.close()
+        self._writer.close()
 
     def write(self, topic: Topic, message: msg.Message, ns: int) -> None:
         """Write a message of a topic at a simulated time, ns."""
@@ -54,10 +54,6 @@ class Recorder(contextlib.AbstractContextManager["Recorder"]):
                 f"/{topic.name}", topic.type, typestore=msg.typestore()
             )
         self._writer.write(self._connections[topic.name], ns, msg.serialize(message))
-
-    def close(self) -> None:
-        """Finish the bag."""
-        self._writer.close()
 
 
 def read(path: Path) -> Iterator[Recorded]:

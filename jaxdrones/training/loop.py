@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
-from jaxdrones.learning.evaluation import Report
+from jaxdrones.learning.evaluation import Report, Score, score_of
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.result import MAX_CALL, PATIENCE, SMALLER, Callback, Diverged, check_gradients
 from jaxdrones.limits import LARGEST_COUNT
@@ -23,11 +23,9 @@ from jaxdrones.training.plan import (
     REPORT_STREAM,
     SELECTION_STREAM,
     STOPPING_EVALUATIONS,
-    Score,
     TimePlan,
     best_of,
     next_evaluation,
-    score_of,
 )
 from jaxdrones.training.run import Progress, Run, report_as_dict
 from jaxdrones.training.trainer import Trainer

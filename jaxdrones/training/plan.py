@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 
 from jaxdrones.errors import UserError
-from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.learning.evaluation import Score, wilson_interval
 from jaxdrones.training import distributed
 
 EVALUATIONS = 10
@@ -22,9 +22,6 @@ SELECTION_STREAM, REPORT_STREAM = 2**31, 2**31 + 1
 They are distinct from the streams 0, 1, 2, ... of a split."""
 
 _STANDARD_ERRORS = 1.0  # half width of the intervals, in standard errors, for a statistical tie of two success rates
-
-Score = tuple[float, float]
-"""Success rate and mean return of an evaluation."""
 
 
 def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> None:
@@ -89,11 +86,6 @@ class TimePlan:
     def next_evaluation(self, updates: int, made: int) -> int:
         """Next update with an evaluation, of `updates` in total."""
         return max(made + 1, self.evaluated + math.ceil((updates - self.evaluated) / self.evaluations))
-
-
-def score_of(success: float | None, mean_return: float) -> Score:
-    """Score of an evaluation; missing success is 0, a return that is NaN is the worst."""
-    return success or 0.0, mean_return if math.isfinite(mean_return) else -math.inf
 
 
 def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0) -> int:

@@ -2,7 +2,8 @@
 
 import pytest
 
-from jaxdrones.training.plan import best_of, score_of
+from jaxdrones.learning.evaluation import score_of
+from jaxdrones.training.plan import best_of
 
 
 @pytest.mark.parametrize(

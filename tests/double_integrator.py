@@ -1,5 +1,7 @@
 """Environments with a known answer, a double integrator and a cue, and small settings of every learner for them."""
 
+from types import SimpleNamespace
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,14 @@ class PointWorld(flax.struct.PyTreeNode):
     poses: None = None
 
 
-class DoubleIntegrator:
+class Untasked:
+    """What learners ask of the task of an environment: no curriculum, any number of truncations, ends of the team."""
+
+    task = SimpleNamespace(start=lambda key, params: None, truncations={"some": None}, ends="team")
+    sets = ()
+
+
+class DoubleIntegrator(Untasked):
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
     drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 50, (), None
@@ -48,7 +57,7 @@ class DoubleIntegrator:
         return x, world, -cost, *outcome(self, jnp.zeros((), bool), world, jnp.abs(x[:, 0]))
 
 
-class Cue:
+class Cue(Untasked):
     """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
 
     The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
@@ -87,7 +96,7 @@ class Cue:
         return world.replace(images={"depth": depth} if self.vision else {})
 
 
-class Clock:
+class Clock(Untasked):
     """A team that observes the time of its episode, which fails after one step half of the time, or lasts `steps`.
 
     Drone i is rewarded 1 + i in every step.

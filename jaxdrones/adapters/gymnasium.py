@@ -86,12 +86,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
-            return None
-        if self._session.world is None:
-            raise gymnasium.error.ResetNeeded("render is called before reset; call reset")
-        return self._session.photo()
+        return self._session.photo() if pictures.wanted(self.render_mode, self._session.world is not None) else None
 
     def close(self) -> None:
         """Close the connection to Bullet, if any."""
@@ -142,7 +137,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:
             self.env = dataclasses.replace(self.env, steps=max_episode_steps)
-        self.autoreset_mode, self.render_mode = _autoreset_mode(autoreset_mode), render_mode
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        self.autoreset_mode = look_up("autoreset_mode", mode, {known.value: known for known in AutoresetMode})
+        self.render_mode = render_mode
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode, "render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
@@ -193,12 +190,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Picture (height, width, 3) of every world from the side, with `render_mode="rgb_array"`."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
-            return None
-        if not self._worlds.started:
-            raise gymnasium.error.ResetNeeded("render is called before reset; call reset")
-        return tuple(pictures.of_worlds(self.env, self._worlds.world))
+        shown = pictures.wanted(self.render_mode, self._worlds.started)
+        return tuple(pictures.of_worlds(self.env, self._worlds.world)) if shown else None
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the connection to Bullet, if any."""
@@ -255,11 +248,6 @@ def ids() -> dict[str, str]:
 
 def _layout(env: envs.Env, by_drone: bool) -> Layout:
     return Layout(env, [str(i) for i in range(env.drones)] if by_drone else None)
-
-
-def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    value = mode.value if isinstance(mode, AutoresetMode) else mode
-    return look_up("autoreset_mode", value, {known.value: known for known in AutoresetMode})
 
 
 def _refuse(options: dict[str, Any] | None) -> None:

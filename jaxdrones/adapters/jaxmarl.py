@@ -104,8 +104,7 @@ class JaxMARLEnv:
             infos with one entry per agent: `rewards` and `metrics` by name, `terminated` and `truncated`.
         """
         if reset_state is None:
-            outcome = self._episodes.step(key, state, self._gathered(actions))
-            return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
+            return self._outcome(*self._episodes.step(key, state, self._gathered(actions)))
         obs, state, rewards, dones, infos = self.step_env(key, state, actions)
         begun = self.get_obs(reset_state), reset_state
         obs, state = jax.tree.map(lambda new, old: jnp.where(dones[ALL], new, old), begun, (obs, state))
@@ -116,8 +115,7 @@ class JaxMARLEnv:
         self, key: jax.Array, state: Episode, actions: Mapping[str, Array]
     ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
         """One control step without reset; the results are those of `step`."""
-        outcome = self._episodes.step_without_reset(key, state, self._gathered(actions))
-        return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
+        return self._outcome(*self._episodes.step_without_reset(key, state, self._gathered(actions)))
 
     @functools.partial(jax.jit, static_argnums=0)
     def get_obs(self, state: Episode) -> dict[str, Any]:
@@ -141,12 +139,14 @@ class JaxMARLEnv:
             by_agent[WORLD_STATE] = jnp.stack([jnp.roll(vectors, -i, axis=0).ravel() for i in range(self.num_agents)])
         return by_agent
 
-    def _outcome(self, reward: Array, terminated: Array, truncated: Array, info: dict[str, Any]) -> tuple:
+    def _outcome(
+        self, obs: Any, state: Episode, reward: Array, terminated: Array, truncated: Array, info: dict[str, Any]
+    ) -> tuple:
         infos = {name: info[name] for name in ("rewards", "metrics", "terminated", "truncated")}
         ended = info["terminated"] | info["truncated"] | ~info["active"]
         rewards = {agent: reward[i] for i, agent in enumerate(self.agents)}
         dones = {agent: ended[i] for i, agent in enumerate(self.agents)} | {ALL: terminated | truncated}
-        return rewards, dones, infos
+        return self._by_agent(obs), state, rewards, dones, infos
 
 
 wrap = JaxMARLEnv

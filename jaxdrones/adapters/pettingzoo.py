@@ -65,9 +65,5 @@ class ParallelEnv(TeamEpisodes, pettingzoo.ParallelEnv):
 
     def render(self) -> np.ndarray | None:
         """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
-            return None
-        if self._session.world is None:
-            raise UserError("render is called before reset; call reset")
-        return self._session.photo()
+        shown = pictures.wanted(self.render_mode, self._session.world is not None, UserError)
+        return self._session.photo() if shown else None

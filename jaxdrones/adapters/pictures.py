@@ -2,6 +2,7 @@
 
 from typing import Annotated, Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,15 @@ RenderMode = Annotated[str | None, choice("render_mode", MODES)]
 _CAMERA = Camera(resolution=(640, 480), field_of_view=60.0)
 _DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the camera, with the sun behind it
 _AT_A_TIME = 8  # pictures of worlds at a time, to fit in a cache
+
+
+def wanted(render_mode: str | None, begun: bool, error: type[Exception] = gymnasium.error.ResetNeeded) -> bool:
+    """Whether `render` draws; a warning without a render mode, and the error before the first reset."""
+    if render_mode is None:
+        gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
+    elif not begun:
+        raise error("render is called before reset; call reset")
+    return render_mode is not None
 
 
 def of_world(env: Env, world: World) -> np.ndarray:

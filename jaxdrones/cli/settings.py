@@ -19,10 +19,6 @@ from jaxdrones.user_code import blame, is_reference
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic")
 
 
-REALISTIC_KINDS = ("any",)
-"""Arguments of --realistic."""
-
-
 def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
     """Add --realistic, with the optional argument `any`; `where` is a prefix of its help."""
     option(
@@ -30,16 +26,16 @@ def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
         "--realistic any",
         f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` a random vehicle "
         "of 20 g to 3 kg in every episode",
-        _kind,
+        _any,
         False,
-        known=REALISTIC_KINDS,
+        known=("any",),
         nargs="?",
         const=True,
     )
 
 
-def _kind(text: str) -> str:
-    if text not in REALISTIC_KINDS:
+def _any(text: str) -> str:
+    if text != "any":
         raise argparse.ArgumentTypeError(f"{text!r} is given; give --realistic alone, or --realistic any")
     return text
 

@@ -204,8 +204,7 @@ def _with_constants(env: Env, episode: Episode) -> Episode:
 
 def progress_of(env: Env, config: Any, step: Array) -> Array | None:
     """Progress of training in [0, 1] after `step` updates for a task with a curriculum; `None` for others."""
-    task = getattr(env, "task", None)
-    return (step / config.updates).astype(jnp.float32) if task and takes(task.start, "progress") else None
+    return (step / config.updates).astype(jnp.float32) if takes(env.task.start, "progress") else None
 
 
 def deterministic(policy: Policy) -> Act:

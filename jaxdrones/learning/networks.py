@@ -181,9 +181,7 @@ class Policy(PyTreeNode):
             ValueError: a network with the wrong input or output for the environment.
         """
         obs = example_observation(env)
-        own = make_network(
-            obs, hidden_sizes, env.action_size, 0.01, recurrent_size, getattr(env, "sets", ()), set_sizes
-        )
+        own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size, env.sets, set_sizes)
         network = own if network is None else OwnNetwork(network, env.action_size)
         params = init_params(key, network, obs, env.drones if per_agent else None)
         policy = cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)

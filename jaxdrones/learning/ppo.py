@@ -132,7 +132,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         privileged=config.privileged_critic,
     )
     learn = sharding.map_worlds(
-        functools.partial(_learn, config, _ends_alone(env)),
+        functools.partial(_learn, config, env.task.ends == "drone"),
         (sharding.REPLICATED, sharding.WORLDS, sharding.STEPS, sharding.STEPS),
         sharding.REPLICATED,
     )
@@ -172,14 +172,7 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
 
 def _most_truncations(env: Env, horizon: int) -> int:
     """Largest number of truncated episodes in one trajectory."""
-    task = getattr(env, "task", None)
-    return -(-horizon // env.steps) if task and not task.truncations else horizon
-
-
-def _ends_alone(env: Env) -> bool:
-    """Whether a drone's episode may end before that of its team."""
-    task = getattr(env, "task", None)
-    return task is not None and task.ends == "drone"
+    return horizon if env.task.truncations else -(-horizon // env.steps)
 
 
 def _learn(

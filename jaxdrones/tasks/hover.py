@@ -161,12 +161,10 @@ def landing(
     )
 
 
-def settled(
-    metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = SETTLED
-) -> Array:
+def settled(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
-    steps = round(last / dt)
-    return jnp.all((metrics["error"][-steps:] < within) & (metrics["speed"][-steps:] < speed), axis=0)
+    steps = round(SETTLED / dt)
+    return jnp.all((metrics["error"][-steps:] < 0.05) & (metrics["speed"][-steps:] < 0.1), axis=0)
 
 
 def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler, one_world
 from jaxdrones.accelerate.chunks import kernel_of_chunks
-from jaxdrones.accelerate.fitting import NoKernelError, can_be_a_kernel, fits_number_by_number
+from jaxdrones.accelerate.fitting import NoKernelError, can_be_a_kernel, fits_number_by_number, has_reverse_rule
 from jaxdrones.accelerate.soa import over_last_axis
 
 P = ParamSpec("P")
@@ -32,7 +32,7 @@ def apart_under_vmap(function: Callable[P, R]) -> Callable[P, R]:
             return function(*arguments, **named)
         leaves, tree = jax.tree.flatten((arguments, named))
         program, consts, shape = compiler.trace_open(lambda *leaves: _called(function, tree, leaves), *leaves)
-        if not _fits(program):
+        if not _fits(program) or has_reverse_rule(program):
             return function(*arguments, **named)
         inputs = [*consts, *map(jnp.asarray, leaves)]
         results = _apart.bind(*inputs, program=program, mapped=(False,) * len(inputs), worlds=None)

@@ -81,6 +81,11 @@ def can_be_a_kernel(program: Any) -> bool:
     )
 
 
+def has_reverse_rule(program: Any) -> bool:
+    """Whether a program has a `jax.custom_vjp`, which has no derivative once it was differentiated as a program."""
+    return any(eqn.primitive.name.startswith("custom_vjp_call") for eqn in _equations(program))
+
+
 def fits_number_by_number(program: Any) -> bool:
     """Whether the loops of a program have few enough entries to split."""
     sizes = list(_sizes_in_loops(program))

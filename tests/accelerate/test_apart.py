@@ -119,6 +119,55 @@ def test_what_cannot_be_apart_is_as_vmap_computes_it(size):
     np.testing.assert_array_equal(ours(x), jax.vmap(function)(x))
 
 
+@jax.custom_vjp
+def slowed(x):
+    """Its gradient is three times its slope."""
+    return jnp.tanh(x)
+
+
+slowed.defvjp(lambda x: (jnp.tanh(x), x), lambda x, back: (3 * back * (1 - jnp.tanh(x) ** 2),))
+
+OF_EACH = {
+    "sort": lambda x: jnp.sort(jnp.sin(3 * x)) * 0.9,
+    "order": lambda x: 1.1 * x + 0.2 * x[jnp.argsort(jnp.cos(x))],
+    "top_k": lambda x: 1.1 * x + jnp.sum(jax.lax.top_k(jnp.cos(x), 2)[0]),
+    "custom_vjp": lambda x: slowed(1.2 * x) + 0.1 * x,
+}
+TAKEN = {
+    "jvp": lambda f: lambda x, along: jax.jvp(f, (x,), (along,)),
+    "grad": lambda f: lambda x, along: jax.grad(lambda x: jnp.sum(f(x) * along))(x),
+    "jvp of grad": lambda f: lambda x, along: jax.jvp(jax.grad(lambda x: jnp.sum(f(x) ** 3)), (x,), (along,)),
+}
+HOW = {
+    "apart": lambda derivative, f: jax.jit(jax.vmap(derivative(apart_under_vmap(f)))),
+    "over_worlds": lambda derivative, f: jd.over_worlds(derivative(f)),
+}
+QUICK_WAYS = [("custom_vjp", "jvp of grad", "apart"), ("top_k", "jvp", "over_worlds"), ("sort", "grad", "apart")]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize(("name", "taken", "how"), mostly_slow_rows(itertools.product(OF_EACH, TAKEN, HOW), QUICK_WAYS))
+def test_derivatives_of_sorting_and_of_rules_for_the_reverse_mode_are_those_of_vmap(name, taken, how, dtype):
+    """In one, 131 and 1,024 worlds; the reverse-mode rule has no forward mode, neither here nor there."""
+    function, derivative = OF_EACH[name], TAKEN[taken]
+
+    def flown(x):
+        return jax.lax.scan(lambda x, _: (function(x), None), x, length=3)[0]
+
+    for worlds in (1, 131, 1024):
+        x, along = (jnp.asarray(rng.normal(size=(worlds, 4)), dtype) for _ in range(2))
+        ours, theirs = HOW[how](derivative, flown), jax.jit(jax.vmap(derivative(flown)))
+        if (name, taken) == ("custom_vjp", "jvp"):
+            for each in ours, theirs:
+                with pytest.raises(TypeError, match="forward-mode autodiff"):
+                    each(x, along)
+            continue
+        for found, expected in zip(*map(jax.tree.leaves, (ours(x, along), theirs(x, along))), strict=True):
+            assert found.dtype == expected.dtype == dtype
+            rounding = 20 * jnp.finfo(dtype).eps * max(1.0, float(jnp.max(jnp.abs(expected))))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=rounding)
+
+
 def test_a_place_that_differs_between_worlds_is_as_vmap_computes_it():
     def written(x, i):
         return jax.lax.dynamic_update_slice(x, 2 * x[:1], (i,))

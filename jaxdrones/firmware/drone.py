@@ -68,9 +68,8 @@ def on_ground(params: Params, x: float = 0.0, y: float = 0.0) -> State:
 def set_upright(params: Params, state: State) -> State:
     """State of one drone (a team of one), moved upright and at rest to the ground below it; model states stay."""
     x, y, _ = np.asarray(state.pos[0]).tolist()
-    same = ("pos", "quat", "vel", "omega", "rpm")
-    start = on_ground(params, x, y)
-    return state.replace(**{name: getattr(start, name).astype(state.pos.dtype) for name in same})
+    start = jax.tree.map(lambda x: x.astype(state.pos.dtype), on_ground(params, x, y))
+    return start.replace(aux=state.aux)
 
 
 def measured(step: Step, team: Params, state: State, rpm: jax.Array) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of, physics_of
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import FlightLog, logged
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
@@ -71,7 +71,7 @@ def fly(
     def record(trajectory: State, first: int) -> FlightLog:
         rows = slice(first, first + len(trajectory.pos))
         return FlightLog(
-            **{name: np.asarray(getattr(trajectory, name)) for name in ("pos", "quat", "vel", "omega", "rpm")},
+            **jax.tree.map(np.asarray, logged(trajectory)),
             **{name: x[rows] for name, x in planned.items()},
             labels=example.labels,
             conditions=conditions,

@@ -13,12 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene
+from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
 STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3}
 """Arrays of the state and their widths."""
+STATE_AND_SPEEDS = STATE | {"rpm": 4}
+"""The same with the rotor speeds, as in a simulated `State`."""
 PERIOD = 0.01
 """Time between the rows of a log prepared for identification, s."""
 OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0, "load_pos": 3}
@@ -118,6 +122,10 @@ class FlightLog:
         """Whether the log has all of these optional arrays."""
         return all(bool(np.isfinite(getattr(self, name)).any()) for name in names)
 
+    def state(self, row: int) -> State:
+        """State of the team (n, ...) at a row."""
+        return State(**{name: getattr(self, name)[row] for name in STATE_AND_SPEEDS})
+
     def drone(self, i: int) -> FlightLog:
         """Log of one drone of a team."""
         arrays: dict[str, Any] = {name: getattr(self, name)[:, i : i + 1] for name in STATE | OPTIONAL}
@@ -177,3 +185,10 @@ class FlightLog:
             self.labels[i]: f"the state of {self.labels[i]} is not finite from t = {self.t[broken[:, i]][0]:.3f} s on"
             for i in np.flatnonzero(broken.any(axis=0))
         }
+
+
+def logged(states: State) -> dict[str, Any]:
+    """Arrays of a log in the states (K, n, ...) of a trajectory; the model `payload` has the positions of loads."""
+    load = states.aux.get("payload")
+    loads = {"load_pos": load.pos} if isinstance(load, PointMass) else {}
+    return {name: getattr(states, name) for name in STATE_AND_SPEEDS} | loads

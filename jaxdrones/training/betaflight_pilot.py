@@ -13,12 +13,12 @@ from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import Sticks, sticks_for
 from jaxdrones.firmware.betaflight.pilots import PERIOD
 from jaxdrones.firmware.drone import Sample
+from jaxdrones.flights.log import STATE_AND_SPEEDS
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.tasks.task import World
 
 ACTION = "thrust_and_rates"
 """Action type that sticks can command."""
-_STATE = ("pos", "quat", "vel", "omega", "rpm")
 
 
 class PolicyPilot:
@@ -54,7 +54,7 @@ class PolicyPilot:
             return self._sticks
         self._steps += 1
         dtype = np.dtype(self._world.drones.pos.dtype)
-        arrays = {name: np.asarray(x, dtype)[None] for name, x in vars(sample).items() if name in _STATE}
+        arrays = {name: np.asarray(x, dtype)[None] for name, x in vars(sample).items() if name in STATE_AND_SPEEDS}
         step = np.asarray(self._steps - 1, np.dtype(self._world.step.dtype))
         world = self._world.replace(drones=self._world.drones.replace(**arrays), step=step)
         self._hidden, self._world, action, target = jax.device_get(self._decide(self._hidden, world))

@@ -11,17 +11,16 @@ import numpy as np
 from jaxdrones.engine.rollout import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
-from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
+from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions, logged
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.visualization.viewer.show import loads_of, records_of, refuse
+from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
 """(hidden_state, observations) -> (hidden_state, actions)"""
-_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states of a `FlightLog`
 
 
 class EpisodeLog(PyTreeNode):
@@ -51,12 +50,10 @@ class EpisodeLog(PyTreeNode):
 
 def to_record(log: EpisodeLog, conditions: LoggedConditions) -> FlightLog:
     """Convert an episode to a `FlightLog`."""
-    drones = jax.tree.map(np.asarray, log.drones)
     return FlightLog(
-        **{name: getattr(drones, name) for name in _LOGGED},
+        **jax.tree.map(np.asarray, logged(log.drones)),
         t=log.t,
         target_pos=log.target,
-        load_pos=np.asarray(np.nan) if loads_of(drones) is None else loads_of(drones),
         conditions=conditions,
         params=log.params,
         scene=log.scene,

@@ -36,8 +36,7 @@ def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Ge
     draw = jax.jit(functools.partial(_draw, camera=camera))
     overlay = Overlay(record, title, shot.scale)
     for k, row in enumerate(shot.rows):
-        state = State(*(getattr(record, name)[row] for name in ("pos", "quat", "vel", "omega", "rpm")))
-        picture, depth = draw(shot.scene, params, state, shot.eyes[k], shot.targets[k], tints)
+        picture, depth = draw(shot.scene, params, record.state(row), shot.eyes[k], shot.targets[k], tints)
         lens = Lens(shot.eyes[k], shot.targets[k], FIELD_OF_VIEW, size)
         yield overlay.draw(np.asarray(picture), np.asarray(depth), lens, int(row), k / fps)
 

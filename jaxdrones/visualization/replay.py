@@ -8,7 +8,6 @@ import numpy as np
 from jaxdrones.engine import bullet
 from jaxdrones.flights.log import FlightLog, ImageSequence
 from jaxdrones.sensing import Camera, camera_2021
-from jaxdrones.state import State
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, rows_of_frames, shoot
 
 FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
@@ -20,7 +19,7 @@ def frames(record: FlightLog, fps: int, size: tuple[int, int]) -> Generator[np.n
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW, near=0.02)
     with bullet.make_step(scene=record.scene) as step:
         for row, eye, target in zip(shot.rows, shot.eyes, shot.targets, strict=True):
-            yield step.photo(record.params, _state(record, row), eye, target, camera)
+            yield step.photo(record.params, record.state(row), eye, target, camera)
 
 
 def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequence:
@@ -30,14 +29,10 @@ def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequen
     t, pictures = [], []
     with bullet.make_step(scene=record.scene) as step:
         for frame, row in enumerate(rows_of_frames(record, fps)):
-            rgb = step.camera(record.params, _state(record, row), camera_2021).rgb
+            rgb = step.camera(record.params, record.state(row), camera_2021).rgb
             for label, picture in zip(record.labels, rgb, strict=True):
                 (folder / label).mkdir(parents=True, exist_ok=True)
                 imsave(folder / label / f"{frame:05d}.png", picture)
             t.append(frame / fps)
             pictures.append(np.asarray(rgb))
     return ImageSequence(np.array(t), np.stack(pictures))
-
-
-def _state(record: FlightLog, row: int) -> State:
-    return State(record.pos[row], record.quat[row], record.vel[row], record.omega[row], record.rpm[row])

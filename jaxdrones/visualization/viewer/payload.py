@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import STATE_AND_SPEEDS, FlightLog
 from jaxdrones.sensing.serialization import scene_to_dict
 from jaxdrones.visualization.palette import COLORS, DISTINCT, as_rgb, colors
 from jaxdrones.visualization.shots import only_shapes
@@ -116,7 +116,7 @@ def encode_rows(record: FlightLog) -> str:
 def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
     """Arrays of a flight for the page by name; `None` for unknown targets and loads, and without contact."""
     rows: dict[str, Any] = {"t": arrays.add(record.t)}
-    for name in ("pos", "quat", "vel", "omega", "rpm"):
+    for name in STATE_AND_SPEEDS:
         rows[name] = arrays.add(getattr(record, name), _LARGEST_ERROR.get(name, math.inf))
     optional = {"targets": record.target_pos, "target_vel": record.target_vel, "loads": record.load_pos}
     for name, values in optional.items():

@@ -16,7 +16,7 @@ from jaxdrones.checks import check_choice, check_number, check_params, check_seq
 from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
-from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
+from jaxdrones.flights.log import STATE_AND_SPEEDS, FlightLog, ImageSequence, LoggedConditions, logged
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
@@ -28,7 +28,6 @@ LAYOUTS = {"ghosts": "ghosts", "side by side": "grid", "hidden": "alone"}
 """Initial layouts of other worlds -> names in the page."""
 CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
 """Kinds of images -> whether a pixel has channels."""
-_WIDTHS = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 _PIXELS = {
     "rgb": ("u", "uint8, from 0 to 255"),
     "depth": ("fiu", "numbers, m"),
@@ -188,14 +187,14 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     check_number("dt", dt, "s", above=0)
     check_params(params)
     check_size(flight.pos)
-    loads = {"payload": flight.aux["payload"]} if loads_of(flight) is not None else {}
+    loads = {name: x for name, x in flight.aux.items() if name == "payload" and isinstance(x, PointMass)}
     flight = jax.tree.map(np.asarray, flight.replace(aux=loads))
     if flight.pos.ndim not in (3, 4):
         raise UserError(
             f"pos of the trajectory has shape {flight.pos.shape}; give (K, n, 3) of K times and n drones, or "
             "(W, K, n, 3) of W worlds"
         )
-    for name, width in _WIDTHS.items():
+    for name, width in STATE_AND_SPEEDS.items():
         shape = (*flight.pos.shape[:-1], width)
         if getattr(flight, name).shape != shape or not flight.pos.size:
             given = f"{name} of the trajectory has shape {getattr(flight, name).shape}"
@@ -240,20 +239,13 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Fli
     dt = of_trajectory["dt"]
     return FlightLog(
         t=dt * np.arange(1, steps + 1),
-        **{name: getattr(flight, name) for name in ("pos", "quat", "vel", "omega", "rpm")},
+        **logged(flight),
         target_pos=targets,
-        load_pos=np.asarray(np.nan) if loads_of(flight) is None else loads_of(flight),
         labels=labels,
         conditions=LoggedConditions({}, f"{n} drone{'s' * (n > 1)}, {steps * dt:g} s"),
         params=params,
         images=_images(of_trajectory["images"] or {}, dt * np.arange(1, steps + 1), n),
     )
-
-
-def loads_of(state: State) -> Any:
-    """Positions of the loads of the model `payload` on the cables of drones; `None` without it."""
-    load = state.aux.get("payload")
-    return load.pos if isinstance(load, PointMass) else None
 
 
 def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str, ImageSequence]:

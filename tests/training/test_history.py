@@ -12,7 +12,7 @@ from PIL import Image
 from viewer_payload import decode
 
 from jaxdrones.cli import main
-from jaxdrones.training.history import fly_history
+from jaxdrones.training.episode import fly_history
 from jaxdrones.training.run import Run
 from jaxdrones.visualization import browser
 

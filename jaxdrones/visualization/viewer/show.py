@@ -99,7 +99,7 @@ def show_history(evaluated: Sequence[Any], best: int, label: str, title: str) ->
     """Make a page that plays the flights of a training one after the other.
 
     Args:
-        evaluated: policies of `training.history.fly_history`.
+        evaluated: policies of `training.episode.fly_history`.
         best: number of updates of the policy that the training kept.
         label: name of the value; `success` is a fraction, 0 to 1.
         title: title of the page.

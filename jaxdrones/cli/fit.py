@@ -60,6 +60,10 @@ def _fit(options: argparse.Namespace) -> int:
     report = fit(fitted, params, names, validate, motors, lambda line: print(line, file=sys.stderr), gains)
     write_vehicle(options.output, report, options.vehicle)
     print_results(options, report_as_dict(report) | {"output": str(options.output)}, parameter_table(report))
+    try:
+        load_params(options.output / URDF)
+    except UserError as error:  # estimates without physical meaning, such as a negative drag
+        print_warning(f"no command accepts the fitted vehicle ({error}); leave such parameters out of --parameters")
     files = [URDF, REPORT]
     if not options.no_figure:
         try:

@@ -18,7 +18,7 @@ from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
-from jaxdrones.flights.fit import _estimate
+from jaxdrones.flights.fit import Estimate, Report, _estimate
 from jaxdrones.flights.least_squares import standard_errors
 from jaxdrones.flights.open_loop import _shifted, residuals
 from jaxdrones.flights.parameters import check_guess
@@ -159,6 +159,18 @@ def test_the_firmware_has_the_gains_of_the_propellers(monkeypatch, tmp_path):
     ((_, _, motors, gains, _),) = given
     jax.tree.map(np.testing.assert_array_equal, gains, firmware_pid.gains(propellers="2.1"))
     jax.tree.map(np.testing.assert_array_equal, motors, crazyflie_motors("2.1"))
+
+
+def test_a_fitted_vehicle_that_no_command_accepts_is_written_with_a_warning(monkeypatch, tmp_path, capsys):
+    """A drag that noise made negative was written without a word, and refused by the next command."""
+    params = jaxdrones.load_params("cf2x")
+    vehicle = Vehicle.of(params.replace(drag_coeff=params.drag_coeff.at[2].set(-1e-8)))
+    report = Report(vehicle, {"drag_coeff_z": Estimate(-1e-8, 2e-9, True)}, {}, (), {})
+    monkeypatch.setattr(importlib.import_module("jaxdrones.cli.fit"), "fit", lambda *arguments: report)
+    assert main(["fit", NANOBENCH, "--output", str(tmp_path / "fit"), "--no-figure"]) == 0
+    said = capsys.readouterr()
+    assert "drag_coeff_z  -1e-08" in said.out and (tmp_path / "fit" / "vehicle.urdf").exists()
+    assert re.search(r"no command accepts .*drag_coeff=.* should be 0 to 1\); leave such parameters out", said.err)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, as_numpy, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
-from jaxdrones.arguments import Count, checked
+from jaxdrones.arguments import Count, Switch, checked
 from jaxdrones.checks import check_whole, look_up, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
@@ -41,7 +41,7 @@ class GymnasiumEnv(gymnasium.Env):
         self,
         task: str | Task | envs.Env,
         *,
-        dict_spaces: bool = False,
+        dict_spaces: Switch = False,
         team_reward: str = "sum",
         render_mode: pictures.RenderMode = None,
         **options: Any,
@@ -110,9 +110,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         task: str | Task | envs.Env,
         num_envs: Count = 1,
         *,
-        dict_spaces: bool = False,
+        dict_spaces: Switch = False,
         team_reward: str = "sum",
-        numpy: bool = True,
+        numpy: Switch = True,
         max_episode_steps: Count | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: pictures.RenderMode = None,

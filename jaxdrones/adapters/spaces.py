@@ -54,20 +54,20 @@ class Layout:
         """Convert an action in this layout to an array (*batch, n, a).
 
         Raises:
-            ValueError: a missing action, a wrong shape, or NaN (in a NumPy array).
+            ValueError: a missing action, a wrong shape, or NaN (of a batch, in NumPy arrays only).
         """
         if not self.names:
             alone = self.drones == 1
             meaning = f"{self.size} numbers" if alone else f"{self.size} numbers for each of {self.drones} drones"
             shape = (*batch, self.size) if alone else (*batch, self.drones, self.size)
-            action = _check(action, "action", shape, meaning)
+            action = _check(action, "action", shape, meaning, batch)
             return action[..., None, :] if alone else action
         if not isinstance(action, Mapping) or set(action) != set(self.names):
             given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
             raise UserError(
                 f"action is for {given or 'no drone'}; give a dict with one each for {', '.join(self.names)}"
             )
-        rows = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
+        rows = [_check(action[name], f"action of {name}", (*batch, self.size), "", batch) for name in self.names]
         stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
         return stack(rows, axis=len(batch))
 
@@ -79,8 +79,8 @@ class Layout:
         return self.gather(actions)
 
 
-def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str) -> Any:
-    if not isinstance(action, jax.Array):
+def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str, batch: tuple[int, ...]) -> Any:
+    if not (batch and isinstance(action, jax.Array)):
         action = np.asarray(action, np.float32)
         if not np.isfinite(action).all():
             bad = np.argwhere(~np.isfinite(action))

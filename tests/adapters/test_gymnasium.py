@@ -2,6 +2,7 @@ import functools
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -117,6 +118,12 @@ def test_mistakes_are_named(env_of):
         env.step(np.zeros(3))
     with pytest.raises(ValueError, match="not finite in 1 of 4 entries, the first at"):
         env.step(np.array([0, np.nan, 0, 0]))
+    with pytest.raises(ValueError, match="not finite in 1 of 4 entries, the first at"):
+        env.step(jnp.array([0, jnp.nan, 0, 0]))
+    assert env.step(jnp.zeros(4, int))[2:4] == (False, False)
+    for option in ({"numpy": "no"}, {"dict_spaces": 1}):
+        with pytest.raises(ValueError, match=f"{next(iter(option))} is .*; give True or False"):
+            VectorEnv("hover", 3, **option)
     with pytest.raises(ValueError, match=r"\(4,\); expected \(3, 4\)"):
         envs.step(np.zeros(4))
     with pytest.raises(ValueError, match="not finite"):

@@ -1,3 +1,4 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import mostly_slow
@@ -56,5 +57,7 @@ def test_mistakes_are_named(env_of):
         env.step({"drone_0": np.zeros(4), "drone_1": np.zeros(3)})
     with pytest.raises(ValueError, match="action of drone_1 is not finite"):
         env.step({"drone_0": np.zeros(4), "drone_1": np.full(4, np.nan)})
+    with pytest.raises(ValueError, match="action of drone_1 is not finite"):
+        env.step({"drone_0": np.zeros(4), "drone_1": jnp.full(4, jnp.nan)})
     with pytest.raises(TypeError, match="unexpected keyword argument 'color'"):
         parallel_env("leader-follower", color="red")

@@ -17,6 +17,7 @@ from jaxdrones.pytree import PyTreeNode
 
 _FLICKER_FLOOR = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise over its bias instability
 _PEAK = 0.61736  # the largest Allan deviation of a Gauss-Markov process over its standard deviation, at 1.89 times T
+_SMALL_RATIO = 0.01  # of averaging and correlation time, below which a series is used
 _NAME = "{argument} of {function}"
 _AMOUNT, _POSITIVE = number(name=_NAME, at_least=0), number(name=_NAME, above=0, infinite=True)
 
@@ -103,9 +104,11 @@ class Noise:
         White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C).
         """
         t = np.asarray(time, float)
-        ratio = self.correlation / t
-        decay = 3 - 4 * np.exp(-1 / ratio) + np.exp(-2 / ratio)
-        drift = 2 * self.drift**2 * ratio * (1 - ratio / 2 * decay)
+        ratio = t / self.correlation
+        series = ratio * (1 / 3 + ratio * (-1 / 4 + ratio * (7 / 60 + ratio * (-1 / 24 + ratio * 31 / 2520))))
+        exact = np.maximum(ratio, _SMALL_RATIO)  # below it the difference is rounded
+        decay = 3 - 4 * np.exp(-exact) + np.exp(-2 * exact)
+        drift = 2 * self.drift**2 * np.where(ratio < _SMALL_RATIO, series, (1 - decay / (2 * exact)) / exact)
         return np.sqrt(self.density**2 / t + drift + self.random_walk**2 * t / 3)
 
 

@@ -252,12 +252,8 @@ def check_key(name: str, key: Any) -> None:
     if not isinstance(key, jax.Array | np.ndarray):
         raise UserError(f"{name} is {short_repr(key)}; {example}")
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    one = () if typed else _raw_key_shape()
+    one = () if typed else jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape
     if not typed and (key.dtype != np.uint32 or key.shape[key.ndim - len(one) :] != one):
         raise UserError(f"{name} is an array of {key.dtype} and shape {key.shape}; {example}")
     if key.shape != one:
         raise UserError(f"{name} has shape {key.shape}; give one key, and use jax.vmap for many")
-
-
-def _raw_key_shape() -> tuple[int, ...]:
-    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape

@@ -30,7 +30,8 @@ def check_env(env: Env, steps: int = 5) -> None:
     obs, world = env.reset(key)
     _check_obs(env, obs, "after reset")
     _check_equal(env.reset(key), (obs, world), "two resets with the same key")
-    keys, actions = _random_actions(env, steps)
+    keys = jax.random.split(jax.random.key(1), steps)
+    actions = jax.random.uniform(jax.random.key(2), (steps, env.drones, env.action_size), float, -0.3, 0.3)
     flown = []
     for k in range(steps):
         before = jax.tree.map(np.array, world)
@@ -42,12 +43,6 @@ def check_env(env: Env, steps: int = 5) -> None:
     _check_refusals(env, key, world)
     if not isinstance(env.physics, HostStep):
         _check_transformations(env, keys, actions, flown)
-
-
-def _random_actions(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
-    key, action_key = jax.random.split(jax.random.key(1))
-    shape = (steps, env.drones, env.action_size)
-    return jax.random.split(key, steps), jax.random.uniform(action_key, shape, float, -0.3, 0.3)
 
 
 def _check_obs(env: Env, obs: Any, where: str) -> None:

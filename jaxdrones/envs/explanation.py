@@ -16,7 +16,6 @@ from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, check_quantities, description
 from jaxdrones.sensing import Scene
-from jaxdrones.tasks.task import ObservationTerm
 
 _STANDARD_METRICS = {"error": "Distance from the target, m.", "speed": "Speed, m/s."}
 _UNKNOWN = "?"  # the unit of a number that a term does not describe
@@ -116,7 +115,8 @@ def explain(env: Env) -> Explanation:
         raise UserError(f"env is {short_repr(env)}; give an environment, for example jaxdrones.make('hover')")
     task = env.task
     drone = jax.tree.map(lambda x: x[0], env.params)
-    action = _action_quantities(env, drone)
+    described = env.action.entries(drone) if env.action.entries else ()
+    action = _checked(f"the action type {env.action.name}".strip(), described, env.action_size)
     return Explanation(
         task={
             "name": task.name,
@@ -155,21 +155,10 @@ def _observed(env: Env, action: tuple[Quantity, ...]) -> Iterable[Entry]:
     bounds = iter(env.observation_bound.tolist())
     for i, (term, size) in enumerate(zip(env.terms, env.term_sizes, strict=True)):
         name = term.name or f"term {i}"
-        for quantity in _quantities(term, name, size, env.drones, action):
+        described = term.entries(env.drones, action) if callable(term.entries) else term.entries
+        for quantity in _checked(f"the observation term {name}", described, size):
             bound = next(bounds)
             yield Entry(name, quantity, -bound, bound)
-
-
-def _quantities(
-    term: ObservationTerm, name: str, size: int, drones: int, action: tuple[Quantity, ...]
-) -> tuple[Quantity, ...]:
-    described = term.entries(drones, action) if callable(term.entries) else term.entries
-    return _checked(f"the observation term {name}", described, size)
-
-
-def _action_quantities(env: Env, drone: Params) -> tuple[Quantity, ...]:
-    described = env.action.entries(drone) if env.action.entries else ()
-    return _checked(f"the action type {env.action.name}".strip(), described, env.action_size)
 
 
 def _checked(what: str, described: tuple[Quantity, ...], size: int) -> tuple[Quantity, ...]:

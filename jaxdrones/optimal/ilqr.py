@@ -174,8 +174,7 @@ def solve(
         start = before(after)
         models = jax.vmap(lambda x, u: linearize_step(step, params, x, unit * u))(start, commands)
         slopes, curvatures = jax.vmap(lambda x, wanted, m: _expanded(params, x, wanted, m))(after, ahead, matrices)
-        backward = _backward((*models, slopes, curvatures, commands, nominal), r, high, regularization)
-        changes, new_gains = backward
+        changes, new_gains = _backward((*models, slopes, curvatures, commands, nominal), r, high, regularization)
         tried = jax.vmap(lambda size: fly(commands + size * changes, start, new_gains))(sizes)
         costs = jnp.where(jnp.isfinite(tried[2]), tried[2], jnp.inf)
         best = jnp.argmin(costs)

@@ -19,6 +19,7 @@ from jaxdrones.sensing import Camera
 
 _NS = 1_000_000_000
 _LITHIUM_POLYMER, _DISCHARGING, _HEALTH_GOOD = 3, 2, 1  # constants of sensor_msgs/BatteryState
+_LARGEST = 1e9  # in any unit: the controllers' squares of larger numbers are beyond float32
 _AMPERE_HOUR = 3600.0  # A s
 
 
@@ -137,7 +138,8 @@ def to_command(name: str, message: Any) -> Command:
     """Convert a message of the topic `name` of `topics.COMMANDS` to a command of one drone.
 
     Raises:
-        Refused: numbers that are not finite, an unknown frame, a zero quaternion, or a wrong number of rotors.
+        Refused: numbers that are not finite or too large, an unknown frame, a zero quaternion, or a wrong number of
+            rotors.
     """
     if name == "cmd_motors":
         if len(message.data) != 4:
@@ -167,6 +169,6 @@ def numbers(vector: Any) -> tuple[float, ...]:
 
 
 def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:
-    if not all(map(math.isfinite, values)):
-        raise Refused(name, f"is {short_repr(values)}", "give finite numbers")
+    if not all(abs(x) <= _LARGEST for x in values):
+        raise Refused(name, f"is {short_repr(values)}", f"give finite numbers, at most {_LARGEST:g}")
     return values

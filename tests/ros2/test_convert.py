@@ -13,6 +13,7 @@ from ros2_team import make_simulation
 import jaxdrones as jd
 from jaxdrones.ros2 import Mode, convert, topics
 from jaxdrones.ros2 import messages as msg
+from jaxdrones.ros2.simulation import Simulation
 from jaxdrones.sensing import Camera
 
 pytestmark = pytest.mark.needs("rosbags")
@@ -117,6 +118,9 @@ def test_a_message_becomes_a_command():
         ("cmd_pose", pose(w=0.0), "orientation has length 0"),
         ("cmd_pose", pose(x=math.nan), "position is .*finite"),
         ("cmd_vel", msg.Twist(msg.Vector3(math.inf)), "linear is .*finite"),
+        ("cmd_vel", msg.Twist(msg.Vector3(-1e15)), "linear is .*; give finite numbers, at most 1e.09"),
+        ("cmd_vel", msg.Twist(angular=msg.Vector3(z=1e300)), "angular is .*; give finite numbers, at most 1e.09"),
+        ("cmd_motors", msg.Float64MultiArray(data=(1.0, 2.0, 3.0, 2e9)), "data is .*at most 1e.09"),
         ("cmd_rates", msg.Twist(msg.Vector3(z=-1.0)), "collective thrust"),
         ("cmd_motors", msg.Float64MultiArray(data=(1.0, 2.0)), "data has 2 numbers; give 4 rotor speeds"),
     ],
@@ -124,6 +128,27 @@ def test_a_message_becomes_a_command():
 def test_a_message_that_cannot_be_flown_is_refused(name, message, says):
     with pytest.raises(ValueError, match=says):
         convert.to_command(name, message)
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("vehicle", ["cf2x", "hb"])
+def test_a_command_with_the_largest_numbers_leaves_a_drone_that_follows_the_next_one(vehicle):
+    """A velocity of 1e15 m/s was finite, and the drone had no finite position for the rest of the flight."""
+    step = jd.make_step(dt=1 / 240, substeps=2)
+    simulation = Simulation(step, jd.repeat(jd.load_params(vehicle), 1), jd.State.at_rest([[0.0, 0.0, 1.0]]), 120)
+    (hold,), most = simulation.commands, 1e9
+    twist = msg.Twist(msg.Vector3(most, -most, most), msg.Vector3(most, -most, most))
+    commands = {
+        "cmd_pose": pose(x=-most),
+        "cmd_vel": twist,
+        "cmd_rates": twist,
+        "cmd_motors": convert.motors([most] * 4),
+    }
+    for name, message in commands.items():
+        for command in convert.to_command(name, message), hold:
+            simulation.commands = [command]
+            simulation.advance()
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves((simulation.state, simulation._memory))), name
 
 
 def test_drones_and_their_topics_have_the_names_of_the_table():

@@ -130,6 +130,7 @@ def test_a_message_that_cannot_be_flown_is_refused(name, message, says):
         convert.to_command(name, message)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("vehicle", ["cf2x", "hb"])
 def test_a_command_with_the_largest_numbers_leaves_a_drone_that_follows_the_next_one(vehicle):

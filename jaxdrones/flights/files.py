@@ -256,12 +256,12 @@ def _columns(name: str, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
 
 def _check(log: FlightLog) -> None:
     """Raise unless time increases, and states are finite up to a possible divergence."""
-    steps = np.diff(log.t)
-    if not np.isfinite(log.t).all() or not (steps > 0).all():
-        row = int(np.argmin(np.append(steps, 1) > 0)) + 1
+    rises = np.isfinite(log.t) & np.append(True, log.t[1:] > log.t[:-1])
+    if not rises.all():
+        row = int(np.argmin(rises))
+        before = f"goes from {log.t[row - 1]:g} to" if row else "is"
         raise UserError(
-            f"{log.name}: time goes from {log.t[row - 1]:g} to {log.t[row]:g} s in row {row}; sort the rows by time, "
-            "and remove broken ones"
+            f"{log.name}: time {before} {log.t[row]:g} s in row {row}; sort the rows by time, and remove broken ones"
         )
     names = (*STATE, *["rpm"] * log.has("rpm"))
     finite = np.isfinite(np.concatenate([getattr(log, name) for name in names], axis=-1)).all(axis=-1)
@@ -270,7 +270,8 @@ def _check(log: FlightLog) -> None:
         row, drone = broken[0].tolist()
         where = f"before row {row}" if row else "in row 0"
         raise UserError(f"{log.name}: the state of {log.labels[drone]} is not finite {where}; remove such rows")
-    length = np.linalg.norm(log.quat.astype(float), axis=-1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(log.quat.astype(float), axis=-1)
     if (np.abs(length - 1) > _MAX_STRETCH).any():
         row, drone = np.argwhere(np.abs(length - 1) > _MAX_STRETCH)[0].tolist()
         raise UserError(

@@ -33,6 +33,11 @@ def test_a_log_is_read_as_it_was_written(columns, tmp_path):
         (lambda c: c.pop("vel"), "has no column 'vel'"),
         (lambda c: c.pop("rpm"), r"has no column 'pwm' \(or rpm\)"),
         (lambda c: c.update(t=c["t"][::-1]), "time goes from 2.99 to 2.98 s in row 1"),
+        (lambda c: c.update(t=np.append(c["t"][:-1], np.inf)), "time goes from 2.98 to inf s in row 299"),
+        (lambda c: c.update(t=np.full(300, np.nan)), "time is nan s in row 0"),
+        (lambda c: c.update(t=c["t"] + np.inf), "time is inf s in row 0"),
+        (lambda c: c.update({k: v[:1] for k, v in c.items()}, t=np.array([np.nan])), "time is nan s in row 0"),
+        (lambda c: c.update(quat=c["quat"] * 1e300), "has a length of (inf|1e.300) in row 0"),
         (lambda c: c.update(t=2 * c["t"]), "rows are 0.02 s apart; record them"),
         (
             lambda c: c.update(pos=np.where(np.arange(300)[:, None] == 7, np.nan, c["pos"])),

@@ -1,8 +1,6 @@
 """State of a team."""
 
-from __future__ import annotations
-
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import flax.struct
 import jax.numpy as jnp
@@ -34,7 +32,7 @@ class State(PyTreeNode):
 
     @classmethod
     @checked
-    def at_rest(cls, pos: Annotated[ArrayLike, _ROWS], yaw: ArrayLike | None = None) -> State:
+    def at_rest(cls, pos: Annotated[ArrayLike, _ROWS], yaw: ArrayLike | None = None) -> Self:
         """Level team at rest with stopped rotors; positions (n, 3), m, world, and headings (n,), rad, zero by default.
 
         Raises:

@@ -1,13 +1,11 @@
 """Request of `jaxdrones train`: validated options, runs and recipe."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import dataclasses
 import itertools
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from jaxdrones import arguments
 from jaxdrones.cli.common import run_folder
@@ -34,7 +32,7 @@ class Request(argparse.Namespace):
     """
 
     @classmethod
-    def of(cls, options: argparse.Namespace) -> Request:
+    def of(cls, options: argparse.Namespace) -> Self:
         """Request of a command line."""
         if options.seed is not None:
             arguments.seed("the last seed", options.seed + options.seeds - 1)
@@ -51,7 +49,7 @@ class Request(argparse.Namespace):
         output = options.output or run_folder(options.task)
         return cls(**vars(options) | {"settings": settings, "seconds": seconds, "output": output, "row": ""})
 
-    def swept(self) -> list[Request]:
+    def swept(self) -> list[Self]:
         """Request for each combination of the values of --sweep, each with its own folder."""
         rows = [parse_sweep(text) for text in self.sweep]
         for name, _ in rows:
@@ -65,7 +63,7 @@ class Request(argparse.Namespace):
             settings = dict(zip(names, values, strict=True))
             row = ",".join(f"{name}={x}".replace(" ", "").replace("/", "-") for name, x in settings.items())
             own = {"settings": self.settings | settings, "output": self.output / row, "row": row}
-            requests.append(Request(**vars(self) | own))
+            requests.append(type(self)(**vars(self) | own))
         return requests
 
     @property

@@ -1,12 +1,10 @@
 """Environments as two pure functions, `reset` and `step`."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -105,10 +103,10 @@ class Env:
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return _unpickled, (cloudpickle.dumps(fields),)
 
-    def __copy__(self) -> Env:
+    def __copy__(self) -> Self:
         return self
 
-    def __deepcopy__(self, memo: dict) -> Env:
+    def __deepcopy__(self, memo: dict) -> Self:
         return self
 
     def __repr__(self) -> str:
@@ -255,7 +253,7 @@ class Env:
         if isinstance(self.physics, HostStep):
             self.physics.close()
 
-    def __enter__(self) -> Env:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_) -> None:

@@ -1,11 +1,9 @@
 """Layers as calls of a few functions on arrays, in little working memory; C and JavaScript print these calls."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,7 +20,7 @@ class Span:
     """`work`, or an argument of the caller: `obs`, an image, `hidden`, `act`."""
     start: int = 0
 
-    def __add__(self, offset: int) -> Span:
+    def __add__(self, offset: int) -> Self:
         return dataclasses.replace(self, start=self.start + offset)
 
 

@@ -1,12 +1,10 @@
 """Flight logs: states, rotor speeds, commands and conditions."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -126,7 +124,7 @@ class FlightLog:
         """State of the team (n, ...) at a row."""
         return State(**{name: getattr(self, name)[row] for name in STATE_AND_SPEEDS})
 
-    def drone(self, i: int) -> FlightLog:
+    def drone(self, i: int) -> Self:
         """Log of one drone of a team."""
         arrays: dict[str, Any] = {name: getattr(self, name)[:, i : i + 1] for name in STATE | OPTIONAL}
         params = jax.tree.map(lambda x: x[i : i + 1], self.params)

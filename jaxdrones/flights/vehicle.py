@@ -1,11 +1,10 @@
 """Vehicles with a measurement model of their logs, and folders of identified vehicles."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
 from pathlib import Path
+from typing import Self
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,7 +40,7 @@ class Instruments(PyTreeNode):
     """() delay of position and attitude in the onboard state estimate, s."""
 
     @classmethod
-    def ideal(cls) -> Instruments:
+    def ideal(cls) -> Self:
         """Instruments without errors: the log is the flight."""
         return cls(jnp.zeros(()), jnp.zeros(2), jnp.ones(()), jnp.zeros(()), jnp.ones(()), jnp.zeros(()))
 
@@ -79,7 +78,7 @@ class Vehicle(PyTreeNode):
     instruments: Instruments
 
     @classmethod
-    def of(cls, params: Params) -> Vehicle:
+    def of(cls, params: Params) -> Self:
         """Vehicle with ideal instruments."""
         return cls(params, Instruments.ideal())
 

@@ -1,8 +1,6 @@
 """Policies for all quadrotors: a recurrent network that adapts to the vehicle, and the arrangement of its rotors."""
 
-from __future__ import annotations
-
-from typing import Any
+from typing import Any, Self
 
 import flax.struct
 import jax
@@ -40,7 +38,7 @@ class AdaptivePolicy(PyTreeNode):
     """Indices of its rotors: front right, rear right, rear left, front left in those axes."""
 
     @classmethod
-    def of(cls, name: str, network: RecurrentPolicy, env: Env) -> AdaptivePolicy:
+    def of(cls, name: str, network: RecurrentPolicy, env: Env) -> Self:
         """Policy for the nominal vehicle of an environment."""
         names = tuple(term.name for term in env.terms)
         if names[: len(OBSERVED)] != OBSERVED or env.action.name != "throttle":

@@ -1,11 +1,9 @@
 """Policies: built-in and user-defined networks of normalized observations."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Protocol, cast, runtime_checkable
+from typing import Annotated, Any, Protocol, Self, cast, runtime_checkable
 
 import flax.errors
 import flax.linen as nn
@@ -170,7 +168,7 @@ class Policy(PyTreeNode):
         recurrent_size: int = 0,
         network: Any = None,
         set_sizes: Sequence[int] = (32, 32),
-    ) -> Policy:
+    ) -> Self:
         """Create a policy with actions near zero, which is hover in most action types.
 
         With `per_agent` every drone has its own network; otherwise all drones share one. `recurrent_size` is 0 without
@@ -209,7 +207,7 @@ class Policy(PyTreeNode):
         whose = ", one network per drone" if self.per_agent else ""
         return f"<Policy {layers}, {numbers:,} parameters{whose}{counted}>"
 
-    def with_obs_stats(self, obs_stats: RunningStatistics) -> Policy:
+    def with_obs_stats(self, obs_stats: RunningStatistics) -> Self:
         """Policy with new statistics, except for the rows of sets, which are not normalized: their order is random."""
         for at, rows, size, _ in getattr(self.network, "sets", ()):
             columns = slice(at, at + rows * size)

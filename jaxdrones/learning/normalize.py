@@ -1,8 +1,7 @@
 """Running mean and variance of observations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
+from typing import Self
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -26,12 +25,12 @@ class RunningStatistics(PyTreeNode):
     """() number of vectors."""
 
     @classmethod
-    def empty(cls, size: int) -> RunningStatistics:
+    def empty(cls, size: int) -> Self:
         """Statistics before the first vector: mean 0 and variance 1, replaced by the first vectors."""
         return cls(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
     @classmethod
-    def of(cls, obs: Float[Array, "*batch d"], where: Bool[Array, "*batch"] | None = None) -> RunningStatistics:
+    def of(cls, obs: Float[Array, "*batch d"], where: Bool[Array, "*batch"] | None = None) -> Self:
         """Statistics of the vectors along the last axis, optionally with a mask."""
         batch_axes = tuple(range(obs.ndim - 1))
         counts = jnp.ones((1,) * obs.ndim, bool) if where is None else where[..., None]
@@ -42,17 +41,17 @@ class RunningStatistics(PyTreeNode):
 
     def update(
         self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf, where: Bool[Array, "*batch"] | None = None
-    ) -> RunningStatistics:
+    ) -> Self:
         """Update the statistics with the vectors `where` a mask holds, by default all (Chan et al. 1983).
 
         `window` limits the weight of the old vectors, as a number of vectors, so that early ones are forgotten.
         """
-        new = RunningStatistics.of(obs, where)
+        new = self.of(obs, where)
         old_count = jnp.minimum(self.count, window)
         count = jnp.maximum(old_count + new.count, 1)
         shift = new.mean - self.mean
         var = (old_count * self.var + new.count * new.var) / count + shift**2 * (old_count * new.count / count**2)
-        return RunningStatistics(self.mean + shift * (new.count / count), var, old_count + new.count)
+        return type(self)(self.mean + shift * (new.count / count), var, old_count + new.count)
 
     @property
     def scale(self) -> Array:

@@ -1,6 +1,6 @@
 """RAPTOR, a published policy for all quadrotors. Needs the extra `raptor`."""
 
-from __future__ import annotations
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ class Raptor(PyTreeNode):
     weights: dict[str, Array]
 
     @classmethod
-    def load(cls) -> Raptor:
+    def load(cls) -> Self:
         """Weights of the package foundation-policy."""
         try:
             from foundation_policy import Raptor as Published

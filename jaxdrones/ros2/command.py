@@ -1,9 +1,7 @@
 """Commands of a drone, and their control."""
 
-from __future__ import annotations
-
 import enum
-from typing import Any
+from typing import Any, Self
 
 import flax.struct
 import jax.numpy as jnp
@@ -51,7 +49,7 @@ class Command(flax.struct.PyTreeNode):
     """(4,) rotor speeds, RPM."""
 
     @classmethod
-    def zero(cls, mode: Mode, **given: Any) -> Command:
+    def zero(cls, mode: Mode, **given: Any) -> Self:
         """Command of one drone with zero defaults."""
         sizes: dict[str, tuple[int, ...]] = {"pos": (3,), "vel": (3,), "omega": (3,), "rpm": (4,)}
         numbers = ("pos", "yaw", "vel", "yaw_rate", "omega", "thrust", "rpm")

@@ -4,11 +4,9 @@ A pass has one number per pixel, or two as a complex number, and compiles to a l
 arrays. If each solid ends in a minimum or a maximum, images of a batch that have no solid left cost nothing on a CPU.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -107,7 +105,7 @@ class Ground(PyTreeNode):
     """(4,) the identity."""
 
     @classmethod
-    def of(cls, dtype: DTypeLike) -> Ground:
+    def of(cls, dtype: DTypeLike) -> Self:
         """Ground with a leading axis of length 1."""
         return cls(jnp.zeros((1, 3), dtype), jnp.array([[0, 0, 0, 1]], dtype))
 

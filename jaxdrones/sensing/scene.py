@@ -1,11 +1,9 @@
 """Scene of a ground plane and static obstacles, for every backend, sensor and camera."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import flax.struct
 import jax
@@ -55,7 +53,7 @@ class Scene(PyTreeNode, kw_only=True):
 
     @classmethod
     @checked
-    def of(cls, *obstacles: Obstacle | File, ground: Switch = True) -> Scene:
+    def of(cls, *obstacles: Obstacle | File, ground: Switch = True) -> Self:
         """Build a scene of obstacles of any kind.
 
         Args:
@@ -148,7 +146,7 @@ class Scene(PyTreeNode, kw_only=True):
         return self.distance(point) < 0
 
     @checked
-    def padded(self, **capacity: Annotated[int, whole("capacity of {argument}")]) -> Scene:
+    def padded(self, **capacity: Annotated[int, whole("capacity of {argument}")]) -> Self:
         """Pad the arrays of a scene with inactive obstacles to lengths by name, for example `boxes=8, cylinders=30`.
 
         Worlds with different numbers of obstacles then have one structure, and can be stacked and mapped.

@@ -6,9 +6,7 @@ fraction g/w of the displacement is free of contact. Then it rotates.
 No function here has a gradient.
 """
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +36,7 @@ class Disc(NamedTuple):
     """Radius of the ball, m."""
 
     @classmethod
-    def of(cls, pos: Point, quat: Float[Array, "4"], offset: Number, ring: Number, rounding: Number) -> Disc:
+    def of(cls, pos: Point, quat: Float[Array, "4"], offset: Number, ring: Number, rounding: Number) -> Self:
         """Disc of a drone at a pose, with its center `offset` (m) above the center of mass."""
         axis = rotation.z_axis(quat)
         return cls(pos + offset * axis, axis, ring, rounding)

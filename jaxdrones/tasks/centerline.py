@@ -1,6 +1,6 @@
 """Centerline of a race track: a smooth curve from the start through the gates, and coordinates along and beside it."""
 
-from __future__ import annotations
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ class Centerline(PyTreeNode):
     speed: Array
     """(p, k) speed of a point mass with limited acceleration that starts at rest, m/s."""
 
-    def near(self, index: Int[Array, ""]) -> Centerline:
+    def near(self, index: Int[Array, ""]) -> Self:
         """Points (k, ...) from shortly before to shortly behind the segment to gate `index`, constant in derivatives.
 
         Other parts of the track may cross this one and do not count.

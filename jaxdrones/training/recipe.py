@@ -1,11 +1,9 @@
 """Recipes of trainings: task, learner and settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, Self
 
 from jaxdrones import user_code
 from jaxdrones.checks import check_choice
@@ -48,7 +46,7 @@ class Recipe:
         algorithm: str = "bptt",
         realistic: bool | str = False,
         **changes: Any,
-    ) -> Recipe:
+    ) -> Self:
         """Preset of a task, by name or `file.py:function`, with changes.
 
         These are settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
@@ -78,7 +76,7 @@ class Recipe:
         return entries if self.files else {name: x for name, x in entries.items() if name != "files"}
 
     @classmethod
-    def from_dict(cls, entries: dict[str, Any]) -> Recipe:
+    def from_dict(cls, entries: dict[str, Any]) -> Self:
         """Recipe from the entries of `as_dict`."""
         try:
             user_files.task_of(entries["task"], entries.get("files", {}))

@@ -1,9 +1,7 @@
 """Policies from users' files, and published ones."""
 
-from __future__ import annotations
-
 import dataclasses
-from typing import Any
+from typing import Any, Self
 
 import jax
 
@@ -39,7 +37,7 @@ class UserPolicy:
         """Policy and task for JSON."""
         return dataclasses.asdict(self)
 
-    def recipe(self) -> UserPolicy:
+    def recipe(self) -> Self:
         """Recipe of the environment: this object."""
         return self
 

@@ -1,11 +1,9 @@
 """Trajectories of the high-level commander: polynomials of seventh order, in pieces."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -29,7 +27,7 @@ class Goal(NamedTuple):
     """rad/s."""
 
     @classmethod
-    def at_rest(cls, pos: np.ndarray, yaw: float) -> Goal:
+    def at_rest(cls, pos: np.ndarray, yaw: float) -> Self:
         """Point without motion."""
         return cls(np.array(pos, float), np.zeros(3), np.zeros(3), float(yaw), 0.0)
 

@@ -64,7 +64,9 @@ def inconsistencies(log: FlightLog) -> list[str]:
     from jaxdrones.flights.consistency import Motion, contradictions
 
     flying = np.flatnonzero(log.in_flight)
-    rows = slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
+    if not len(flying):
+        return []
+    rows = slice(int(flying[0]), int(flying[-1]) + 1)
     pos, quat, vel, omega = (np.array(getattr(log, name)[rows, 0]) for name in STATE)  # SciPy needs writable arrays
     motion = Motion(pos, Rotation.from_quat(quat), vel, omega)
     thrusts = (log.rpm**2 if log.has("rpm") else log.pwm)[rows, 0]

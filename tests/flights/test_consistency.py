@@ -187,3 +187,14 @@ def test_commands_refuse_a_contradiction_in_one_line(columns, tmp_path, capsys, 
     assert main([command, str(tmp_path / "flight.npz"), *options]) == 2
     error = capsys.readouterr().err
     assert "quaternions look like w, x, y, z" in error and "--allow-inconsistent" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("running", [0, 1, 20])
+def test_a_log_in_which_not_all_motors_ever_run_is_refused_in_one_line(running, columns_of, tmp_path, capsys):
+    """One motor that stands still ended in a report of a fault of the package."""
+    (log,) = load_flights("B3_figure8_slow_rep2")
+    stands = np.arange(len(log.t)) >= np.argmax(log.in_flight) + running
+    columns = others(columns_of(log), pwm=lambda pwm: np.where(stands[:, None] & (np.arange(4) == 2), 0, pwm))
+    np.savez(tmp_path / "z.npz", **columns)
+    assert main(["score", str(tmp_path / "z.npz"), "--vehicle", "cf21"]) == 2
+    assert "the motors never run for 0.5 s without interruption; give a log of a flight" in capsys.readouterr().err

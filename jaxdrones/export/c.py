@@ -4,6 +4,8 @@ from jaxdrones.export.calls import Call, Program, Span
 from jaxdrones.export.layers import Graph, Tensor
 from jaxdrones.export.text import Description, block_comment, number, numbers
 
+INCLUDED = ("math", "stddef", "stdint")
+"""Names of included headers."""
 _FUNCTIONS = {
     "sigmoid": """
 static inline float NAME_sigmoid(float x)

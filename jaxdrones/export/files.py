@@ -68,6 +68,8 @@ def save(
     """
     if not (name.isidentifier() and name.isascii() and name[0] != "_"):
         raise UserError(f"name is {name!r}; give a letter, then letters, digits and underscores")
+    if to == "c" and name in c.INCLUDED:
+        raise UserError(f"name is {name!r}, and the header includes <{name}.h>; give another name")
     if to == "c" and name != name.lower():
         raise UserError(
             f"name is {name!r}; give lower case letters, as names that differ in case have the same macros in C"

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_shape, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 
@@ -54,7 +54,7 @@ class Layout:
         """Convert an action in this layout to an array (*batch, n, a).
 
         Raises:
-            ValueError: a missing action, a wrong shape, or NaN (of a batch, in NumPy arrays only).
+            ValueError: a missing action, a wrong shape, or NaN (of a batch or a traced action, only in NumPy arrays).
         """
         if not self.names:
             alone = self.drones == 1
@@ -80,7 +80,7 @@ class Layout:
 
 
 def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str, batch: tuple[int, ...]) -> Any:
-    if not (batch and isinstance(action, jax.Array)):
+    if not isinstance(action, jax.Array) or (is_concrete(action) and not batch):
         action = np.asarray(action, np.float32)
         if not np.isfinite(action).all():
             bad = np.argwhere(~np.isfinite(action))

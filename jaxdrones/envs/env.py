@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, Self
+from typing import Any, ParamSpec, Self, TypeVar
 
 import jax
 import numpy as np
@@ -25,19 +25,23 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 RowSet = tuple[int, int, int, float]
 """First column of a set in an observation, number of rows, length of a row, and reach (m); see `ObservationTerm`."""
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 
 
-def in_full_precision(function: Callable) -> Callable:
+def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """Multiply the matrices of a function in the precision of their type; GPUs round float32 to 10 bits by default."""
 
-    def called(*arguments: Any, **named: Any) -> Any:
+    @functools.wraps(function)
+    def called(*arguments: P.args, **named: P.kwargs) -> R:
         with jax.default_matmul_precision("highest"):
             return function(*arguments, **named)
 
-    return functools.wraps(function)(called)
+    return called
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

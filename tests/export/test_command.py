@@ -179,7 +179,7 @@ def test_what_cannot_be_exported_is_said(env, tmp_path):
         save(policy, env, "c", tmp_path, name="2fast")
     with pytest.raises(ValueError, match="name is 'Policy'; give lower case letters, as names that differ in case"):
         save(policy, env, "c", tmp_path, name="Policy")
-    with pytest.raises(ValueError, match="name is 'math', and the header includes <math.h>"):
+    with pytest.raises(ValueError, match=r"name is 'math', and the header includes <math\.h>"):
         save(policy, env, "c", tmp_path, name="math")
     with pytest.raises(ValueError, match=r"policy have \(22, 4\) numbers, those of leader-follower \(12, 1\)"):
         save(policy, jd.make("leader-follower"), "c", tmp_path)

@@ -64,6 +64,9 @@ class Camera:
             check_whole(f"{name} of a camera", pixels)
         object.__setattr__(self, "resolution", tuple(self.resolution))
         check_number("far of a camera", self.far, "m", above=self.near or 0)
+        if self.noise is not None and not callable(getattr(self.noise, "apply", None)):
+            remedy = "give jaxdrones.sensing.DepthNoise(...), or another object with a method apply(key, depth, camera)"
+            raise UserError(f"noise of a camera is {short_repr(self.noise)}; {remedy}")
         for name, length in ("principal_point", 2), ("offset", 3), ("orientation", 4):
             value = getattr(self, name)
             if value is not None:

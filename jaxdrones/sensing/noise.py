@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import Count, Seconds, checked, number
+from jaxdrones.checks import short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
@@ -101,9 +102,12 @@ class Noise:
     def allan_deviation(self, time: ArrayLike) -> np.ndarray:
         """Theoretical Allan deviation of the readings at rest over averaging times (...), s.
 
-        White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C).
+        White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C). Times that are not
+        positive raise `ValueError`.
         """
         t = np.asarray(time, float)
+        if not (t > 0).all():
+            raise UserError(f"time is {short_repr(t)}; give positive averaging times (s)")
         ratio = t / self.correlation
         series = ratio * (1 / 3 + ratio * (-1 / 4 + ratio * (7 / 60 + ratio * (-1 / 24 + ratio * 31 / 2520))))
         exact = np.maximum(ratio, _SMALL_RATIO)  # below it the difference is rounded

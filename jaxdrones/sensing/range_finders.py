@@ -107,7 +107,7 @@ def range_finder(
         ValueError: a direction of zero length, or a number out of range.
     """
     directions = np.asarray(directions, float)
-    if not directions.size or directions.shape[-1] != 3:
+    if not directions.size or directions.shape[-1:] != (3,):
         raise UserError(f"directions have shape {directions.shape}; give (..., 3), one row for each beam")
     lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
     if not (np.isfinite(lengths) & (lengths > 0)).all():

@@ -296,6 +296,7 @@ def test_nonsense_is_refused(arguments, error):
     ("option", "error"),
     [
         (dict(resolution=(0, 48)), "width of a camera is 0"),
+        (dict(noise="strong"), r"noise of a camera is 'strong'; give jaxdrones.sensing.DepthNoise\(...\)"),
         (dict(resolution=64), r"resolution of a camera is 64; give \(width, height\)"),
         (dict(field_of_view=180), "field_of_view of a camera is 180"),
         (dict(orientation=(0, 0, 0, 0)), "orientation of a camera has length 0"),

@@ -100,6 +100,12 @@ def test_too_few_readings_are_refused():
         allan_deviation(np.zeros(20), 0.01, 10)
 
 
+@pytest.mark.parametrize("time", [0, -1.0, [1.0, np.nan]])
+def test_an_averaging_time_that_is_not_positive_is_refused(time):
+    with pytest.raises(ValueError, match=r"^time is .*; give positive averaging times"):
+        Noise(density=1.0).allan_deviation(time)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

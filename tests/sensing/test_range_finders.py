@@ -99,6 +99,7 @@ def test_a_device_is_turned_and_placed_on_the_body():
         (dict(directions=np.array([[1.0, 0, 0], [0, 0, 0]])), "has no length or is not finite"),
         (dict(directions=np.array([0, np.nan, 1.0])), "has no length or is not finite"),
         (dict(directions=np.ones((3, 2))), r"have shape \(3, 2\); give \(..., 3\)"),
+        (dict(directions=1.0), r"have shape \(\); give \(..., 3\)"),
         (dict(orientation=(0, 0, 0, 0)), "orientation of a range finder has length 0"),
         (dict(max_range=-1.0), "max_range of a range finder is -1.0; give a positive number"),
         (dict(noise=-0.1), "noise of a range finder is -0.1"),

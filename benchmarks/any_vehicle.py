@@ -40,6 +40,7 @@ DURATION = 5.0  # s
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
     parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=SEED, help="of the episodes")
 
 
 def conditions() -> dict[str, Env]:
@@ -74,7 +75,7 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         options.episodes, envs = 2, {name: envs[name] for name in ("cf2x", "drawn")}
     rows = []
     for (name, env), policy in itertools.product(envs.items(), options.policies):
-        report = evaluate(env, jd.make_policy(policy, env), jax.random.key(SEED), options.episodes)
+        report = evaluate(env, jd.make_policy(policy, env), jax.random.key(options.seed), options.episodes)
         rows.append({"condition": name, "policy": policy} | outcome(report))
     lines = ["condition                | policy      | success [95 % interval]  | error cm p50    p99"]
     lines += [

@@ -74,11 +74,14 @@ _DOWNWASH_LOSS = 0.07 * 35.0  # `inflow_loss` of the Crazyflie times the speed o
 Vary = Callable[..., Array]
 
 
-def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
+def draw(
+    key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST, light: float = 1.0
+) -> Params:
     """Random quadrotor; gravity, air, wind, external force and `aux` are those of `params`, of one drone.
 
     The ground effect is that of Cheeseman and Bennett; the downwash of equation 6 is off. `lightest` and `heaviest` are
-    the smallest and the largest mass, kg.
+    the smallest and the largest mass, kg. The position of the logarithm of the mass in its range is u**light with a
+    uniform u: a `light` above 1 draws more light vehicles.
 
     Raises:
         ValueError: masses outside 20 g to 3 kg, or the lightest is not first.
@@ -87,7 +90,8 @@ def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: f
     dtype = params.mass.dtype
     mass_key, *keys = jax.random.split(key, len(LAWS) + 1)
     key_of = dict(zip(LAWS, keys, strict=True))
-    mass = jnp.exp(jax.random.uniform(mass_key, (), dtype, np.log(lightest), np.log(heaviest)))
+    where = jax.random.uniform(mass_key, (), dtype) ** light
+    mass = lightest * (heaviest / lightest) ** where
 
     def vary(name: str, median: Array, low: Array, high: Array) -> Array:
         spread = LAWS[name].spread

@@ -1,4 +1,4 @@
-"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`; fine-tunes the one for any vehicle.
+"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`; the one for any vehicle in two trainings.
 
     python website/policies.py [NAME ...]
 
@@ -10,8 +10,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-
-from fine_tuning import fine_tune
 
 ROOT = Path(__file__).parent.parent
 RUNS = ROOT / "runs" / "policies"
@@ -32,7 +30,12 @@ TASKS = (
     "sling",
     "transport",
 )
-_ANY = "any-vehicle"
+_FIRST, _ANY = "any-vehicle-first", "any-vehicle"
+_ARGUMENTS: dict[str, list[str]] = {
+    _FIRST: ["hover", "--realistic", "any"],
+    _ANY: ["--config", "website/fine_tuning.toml", "--from", f"runs/policies/{_FIRST}"],
+}
+"""Arguments of `jaxdrones train` for policies that are not called as their task."""
 _FILES = ("best.json", "best.msgpack", "report.json")
 _HEAD = """# Bundled policies
 
@@ -48,23 +51,25 @@ unless all episodes have the same start.
 
 def main() -> None:
     """Train, copy the policies, and write the table of the README there."""
-    for name in sys.argv[1:] or (*TASKS, _ANY):
+    for name in sys.argv[1:] or (*TASKS, *_ARGUMENTS):
         run = RUNS / name
         if not (run / "report.json").exists():
             shutil.rmtree(run, ignore_errors=True)
             command = [sys.executable, "-c", "import sys; from jaxdrones.cli import main; sys.exit(main())"]
-            task = ["hover", "--realistic", "any"] if name == _ANY else [name]
-            subprocess.run([*command, "train", *task, "--seed", "0", "--output", run], check=True)
+            arguments = [*_ARGUMENTS.get(name, [name]), "--seed", "0", "--output", run.relative_to(ROOT)]
+            subprocess.run([*command, "train", *arguments], cwd=ROOT, check=True)
             (run / "commit").write_text(_git("rev-parse", "--short", "HEAD"))
+        if name == _FIRST:
+            continue
         folder = BUNDLED.parent / _ANY if name == _ANY else BUNDLED / name
         folder.mkdir(parents=True, exist_ok=True)
+        for file in _FILES:
+            shutil.copy(run / file, folder / file)
+        report = json.loads((run / "report.json").read_bytes())
         if name == _ANY:
-            fine_tune(run, folder)
-        else:
-            for file in _FILES:
-                shutil.copy(run / file, folder / file)
-        about = json.loads((folder / "report.json").read_bytes()) | {"commit": (run / "commit").read_text().strip()}
-        (folder / "report.json").write_text(json.dumps(about, indent=2))
+            report["first_training"] = json.loads((RUNS / _FIRST / "report.json").read_bytes())
+        commit = (run / "commit").read_text().strip()
+        (folder / "report.json").write_text(json.dumps(report | {"commit": commit}, indent=2))
     rows = [_row(BUNDLED / task) for task in TASKS if (BUNDLED / task).exists()]
     (BUNDLED / "README.md").write_text(_HEAD + "".join(rows))
 

@@ -88,14 +88,17 @@ class AnyVehicle:
     """kg."""
     heaviest: float = vehicles.HEAVIEST
     """kg."""
+    light: float = 1.0
+    """Power of the distribution of masses; above 1 more vehicles are light. See `vehicles.draw`."""
 
     def __post_init__(self):
+        check_number("light", self.light, above=0)
         vehicles.check_masses(self.lightest, self.heaviest)
         object.__setattr__(self, "__doc__", f"any quadrotor of {self.lightest:g} to {self.heaviest:g} kg")
 
     def __call__(self, key: jax.Array, params: Params) -> Params:
         """Random vehicle, with gravity, air and wind of `params`."""
-        return vehicles.draw(key, params, self.lightest, self.heaviest)
+        return vehicles.draw(key, params, self.lightest, self.heaviest, self.light)
 
     def median(self, params: Params) -> Params:
         """Team of the median vehicle, with gravity, air and wind of the team `params`."""
@@ -131,8 +134,9 @@ def all_randomizations(
     any_vehicle: bool, task: Sequence[Randomization], given: Sequence[Randomization], vehicle: Any
 ) -> tuple[Randomization, ...]:
     """All randomizations of an environment, whole vehicles first."""
-    preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
-    chosen = [*preset, *task, *given]
+    chosen = [*task, *given]
+    if any_vehicle and not any(isinstance(one, AnyVehicle) for one in chosen):
+        chosen.append(AnyVehicle())
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):

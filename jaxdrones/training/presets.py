@@ -7,6 +7,7 @@ from typing import Any
 from jaxdrones.dynamics import instant_rotors
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.observations import last_actions
+from jaxdrones.envs.randomize import AnyVehicle, scaled
 from jaxdrones.learning.adaptive import OBSERVED
 from jaxdrones.tasks.task import Task
 from jaxdrones.training.algorithms import learner
@@ -161,8 +162,14 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "transport": dict(substeps=2),
 }
 """Options of the environment in training, where they differ from those in flight."""
-_REALISTIC_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
-    "hover": dict(delay=(0.0, 0.05)),  # s; up to 40 ms in flight, where policies trained with up to 40 ms oscillate
+_REALISTIC_PRACTICE_OPTIONS: dict[tuple[str, bool | str], dict[str, Any]] = {
+    # Up to 40 ms in flight, where policies trained with up to 40 ms oscillate.
+    ("hover", True): dict(delay=(0.0, 0.05)),
+    # Few of the drawn vehicles are among the lightest, and some vehicles have faster rotors than any drawn one.
+    ("hover", "any"): dict(
+        delay=(0.0, 0.05),
+        randomize=(AnyVehicle(light=2.0), scaled("rotor_rise_time", 0.4, 1.2), scaled("rotor_fall_time", 0.4, 1.2)),
+    ),
 }
 _REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
     # Without the additional reward drones settle a few centimeters away, or too late; with the starts of flight alone
@@ -218,9 +225,9 @@ def preset(
 def _practice_options(task: str, algorithm: str, realistic: bool | str, options: dict[str, Any]) -> dict[str, Any]:
     """Options of the environment in training; with contact, physics steps are not longer than in flight."""
     practice = _PRACTICE_OPTIONS.get(task, {})
-    if realistic is True:
-        practice = practice | _REALISTIC_PRACTICE_OPTIONS.get(task, {})
-        practice = practice | (_REALISTIC_PPO_OPTIONS.get(task, {}) if algorithm == "ppo" else {})
+    practice = practice | _REALISTIC_PRACTICE_OPTIONS.get((task, realistic), {})
+    if realistic is True and algorithm == "ppo":
+        practice = practice | _REALISTIC_PPO_OPTIONS.get(task, {})
     if not (options.get("obstacles") or options.get("contact")):
         return practice
     return {name: value for name, value in practice.items() if name != "substeps"}

@@ -294,6 +294,26 @@ def test_light_vehicles_can_be_asked_for():
             AnyVehicle(*masses)
 
 
+def test_more_light_vehicles_can_be_asked_for():
+    @jax.jit
+    def share(keys, light=2.0):  # below the geometric mean of the limits
+        masses = jax.vmap(lambda key: vehicles.draw(key, CF2X, light=light).mass)(keys)
+        return jnp.mean(masses < jnp.sqrt(0.02 * 3))
+
+    keys = jax.random.split(jax.random.key(0), 2000)
+    np.testing.assert_allclose(share(keys), np.sqrt(0.5), atol=0.03)  # u**2 < 1/2
+    np.testing.assert_allclose(share(keys, 1.0), 0.5, atol=0.03)
+    with pytest.raises(ValueError, match="light is 0"):
+        AnyVehicle(light=0)
+
+
+@pytest.mark.slow
+def test_realistic_any_draws_the_vehicles_that_are_given():
+    env = jd.make("hover", realistic="any", randomize=(AnyVehicle(0.02, 0.03),))
+    masses = jax.jit(jax.vmap(lambda key: env.reset(key)[1].params.mass))(KEYS)
+    assert masses.max() <= 0.03 and env.params.mass < 0.03 and env != jd.make("hover", randomize=(AnyVehicle(0.02, 0.03),))
+
+
 @pytest.mark.float32
 def test_drawn_vehicles_have_the_precision_of_the_parameters():
     one = vehicles.draw(jax.random.key(0), jd.load_params("cf2x"))
@@ -325,7 +345,7 @@ def test_a_vehicle_beside_drawn_ones_is_refused():
     with pytest.raises(ValueError, match="vehicle='hb' is given, but every episode draws a vehicle already; leave out"):
         jd.make("hover", realistic="any", vehicle="hb")
     with pytest.raises(ValueError, match="another AnyVehicle is given"):
-        jd.make("hover", realistic="any", randomize=(AnyVehicle(0.02, 0.1),))
+        jd.make("hover", randomize=(AnyVehicle(0.02, 0.1), AnyVehicle()))
     with pytest.raises(ValueError, match="realistic is 'all'; give True or False or 'any'"):
         jd.make("hover", realistic="all")
     with pytest.raises(ValueError, match="needs rotors with a time constant"):

@@ -311,7 +311,9 @@ def test_more_light_vehicles_can_be_asked_for():
 def test_realistic_any_draws_the_vehicles_that_are_given():
     env = jd.make("hover", realistic="any", randomize=(AnyVehicle(0.02, 0.03),))
     masses = jax.jit(jax.vmap(lambda key: env.reset(key)[1].params.mass))(KEYS)
-    assert masses.max() <= 0.03 and env.params.mass < 0.03 and env != jd.make("hover", randomize=(AnyVehicle(0.02, 0.03),))
+    assert (
+        masses.max() <= 0.03 and env.params.mass < 0.03 and env != jd.make("hover", randomize=(AnyVehicle(0.02, 0.03),))
+    )
 
 
 @pytest.mark.float32

@@ -1,9 +1,12 @@
 """Who may import whom, and what `import jaxdrones` costs."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+from documents import ROOT
 
 import jaxdrones
 
@@ -154,3 +157,13 @@ def test_a_mistake_of_a_user_has_its_own_error():
         raised = [node.exc for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Raise)]
         names = {getattr(getattr(exc, "func", exc), "id", None) for exc in raised}
         assert "ValueError" not in names, f"{file}: raise UserError, which the command line prints as one line"
+
+
+def test_the_map_for_contributors_names_every_module_and_none_that_is_gone():
+    layout = re.search(r"```text\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S)
+    words = set(re.findall(r"\w+", layout[1]))
+    modules = {file.parent.name if file.stem == "__init__" else file.stem for file in FILES}
+    one_command_a_file = {file.stem for file in PACKAGE.glob("cli/*.py")}
+    assert modules - one_command_a_file - {"__main__"} - words == set()
+    functions = {"check_env", "make_step", "over_worlds"}
+    assert {word for word in words if "_" in word} - modules - functions == set()

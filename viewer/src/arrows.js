@@ -1,7 +1,8 @@
 // Arrows of the rotors' thrusts, of the resultant force and torque and of contact forces, and the marks of the targets.
 
 import {
-  ConeGeometry, CylinderGeometry, DynamicDrawUsage, InstancedMesh, Matrix4, MeshBasicMaterial, OctahedronGeometry, Quaternion, Color, Vector3,
+  ConeGeometry, CylinderGeometry, DynamicDrawUsage, InstancedMesh, Matrix4, MeshBasicMaterial, OctahedronGeometry, Quaternion, Color, RingGeometry,
+  Vector3,
 } from "three";
 import { mergeGeometries } from "three/examples/jsm/utils/BufferGeometryUtils.js";
 import { armOf, scratch } from "./flight.js";
@@ -12,7 +13,9 @@ export const THRUST = "#e69f00", FORCE = "#d55e00", TORQUE = "#0072b2", CONTACT 
 const THRUST_ARMS = 1.6; // length of the arrow of a rotor that carries its quarter of the weight, arms
 const FORCE_ARMS = 3; // of a resultant or contact force that equals the weight
 const TARGET_ARMS = 0.55; // half the height of the mark of a target, as large as its drone would be drawn there
+const PAD_ARMS = 2.5; // radius of the ring on the ground about a target that is not higher than an arm
 const BEHIND = { transparent: true, opacity: 0.3, depthTest: false, depthWrite: false };
+const ON_GROUND = { polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -4 };
 const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 
 /** Instances that are set anew in every frame. */
@@ -58,6 +61,7 @@ const arrowMaterial = (color) => new MeshBasicMaterial({ color });
 /** Arrows and targets of one world. */
 export class Arrows {
   constructor(stage, world, colors) {
+    this.stage = stage;
     this.world = world;
     this.arms = world.kinds.map(armOf);
     this.thrust = new Marks(stage, arrowShape(), arrowMaterial(THRUST), 4 * world.n);
@@ -66,7 +70,8 @@ export class Arrows {
     this.contact = new Marks(stage, arrowShape(), arrowMaterial(CONTACT), world.n);
     this.targets = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial({ wireframe: true }), world.n);
     this.insides = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial(BEHIND), world.n); // also seen behind obstacles
-    for (const { mesh } of [this.targets, this.insides]) world.labels.forEach((_, i) => mesh.setColorAt(i, new Color(colors(i))));
+    this.pads = new Marks(stage, new RingGeometry(0.8, 1, 48), new MeshBasicMaterial(ON_GROUND), world.n);
+    for (const { mesh } of [this.targets, this.insides, this.pads]) world.labels.forEach((_, i) => mesh.setColorAt(i, new Color(colors(i))));
   }
 
   show(time, shown, { hidden, ghost, offset }, fleet) {
@@ -95,9 +100,12 @@ export class Arrows {
         this.torque.arrow(i, p, w, there ? (TORQUE_ARMS * arm * w.length()) / (0.01 * weight * this.arms[i]) : 0, 0.13 * arm);
       }
       if (targets) {
-        const known = world.target(row, i, v), size = TARGET_ARMS * this.arms[i] * fleet.scale(world.vehicle[i], v.add(offset)) * (ghost ? 0.6 : 1);
+        const known = world.target(row, i, v), low = known && this.stage.hasGround && Math.abs(v.z) < this.arms[i];
+        const arm = this.arms[i] * fleet.scale(world.vehicle[i], v.add(offset)) * (ghost ? 0.6 : 1), size = TARGET_ARMS * arm;
         const matrix = known ? this.targets.matrix.compose(v, r.identity(), w.set(size, size, size)) : NOWHERE;
         for (const { mesh } of [this.targets, this.insides]) mesh.setMatrixAt(i, matrix);
+        const pad = PAD_ARMS * arm;
+        this.pads.mesh.setMatrixAt(i, low ? this.pads.matrix.compose(v.setZ(offset.z), r.identity(), w.set(pad, pad, 1)) : NOWHERE);
       }
     }
     this.thrust.done(thrust);
@@ -106,5 +114,6 @@ export class Arrows {
     this.contact.done(wrench);
     this.targets.done(targets);
     this.insides.done(targets);
+    this.pads.done(targets);
   }
 }

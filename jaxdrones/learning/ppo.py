@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array
 
 from jaxdrones import arguments
-from jaxdrones.arguments import checked
+from jaxdrones.arguments import Scalar, checked
 from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
@@ -46,6 +46,9 @@ class Config(settings.Config):
     minibatches: arguments.Count = 8
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
     critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
+    critic_learning_rate: arguments.Positive | None = None
+    """Learning rate of the critic; `None` for that of the policy, which `target_kl` may keep too low for a critic of
+    random vehicles."""
     centralized_critic: arguments.Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
     privileged_critic: arguments.Switch = False
@@ -185,6 +188,8 @@ def _learn(
 ):
     """Epochs of gradient steps on a trajectory: (policy parameters, log_std, critic), optimizer state, metrics."""
     batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise, ends_alone))
+    rate, critic_rate = state.learning_rate, config.critic_learning_rate
+    rates = rate, rate, rate if critic_rate is None else critic_rate
 
     def cost(variables, minibatch):
         params, log_std, critic = variables
@@ -193,8 +198,8 @@ def _learn(
     def step(carry, minibatch):
         variables, opt_state = carry
         gradient, metrics = sharding.mean_over_devices(jax.grad(cost, has_aux=True)(variables, minibatch))
-        step, opt_state = _optimizer(config).update(gradient, opt_state)
-        variables = jax.tree.map(lambda x, s: x - (state.learning_rate * s).astype(x.dtype), variables, step)
+        steps, opt_state = _optimizer(config).update(gradient, opt_state)
+        variables = tuple(map(_moved, rates, variables, steps))
         return (variables, opt_state), (metrics["value_loss"], optax.tree.norm(gradient))
 
     carry = (state.policy.params, state.log_std, state.critic), state.opt_state
@@ -203,6 +208,10 @@ def _learn(
     kl = sharding.mean_over_devices(cost(carry[0], jax.tree.map(lambda x: x[0], batch))[1]["kl"])
     metrics = {"value_loss": jnp.mean(value_losses), "kl": kl}
     return *carry, metrics | {"nonfinite_gradients": result.count_nonfinite(norms)}
+
+
+def _moved(rate: Scalar, variables: Any, step: Any) -> Any:
+    return jax.tree.map(lambda x, s: x - (rate * s).astype(x.dtype), variables, step)
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:

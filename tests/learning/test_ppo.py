@@ -1,13 +1,16 @@
-"""Loss of PPO."""
+"""Loss and learning rates of PPO."""
 
 import dataclasses
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import jit_unoptimized
+from jax.flatten_util import ravel_pytree
 
+import jaxdrones as jd
 from jaxdrones.learning import ppo
 
 
@@ -31,3 +34,24 @@ def test_the_loss_of_ppo_has_no_gradient_where_the_clipped_ratio_is_worse_and_fa
     clipped = 1.3 if advantage > 0 else 0.7
     assert [ratio for ratio, slope in slopes.items() if slope == 0] == [clipped]
     assert slope_of(jnp.zeros(1), clipped, 0.1).item() == pytest.approx(-0.1)
+
+
+@pytest.mark.slow
+def test_the_critic_learns_at_its_own_rate_and_the_policy_as_before():
+    env = jd.make("hover", substeps=1)
+    sizes = dict(worlds=8, horizon=4, minibatches=2, hidden_sizes=(4,), critic_hidden_sizes=(4,))
+    config = ppo.Config(**sizes, max_grad_norm=1e9)  # a limit would couple the two by the norm of their gradients
+    before = ppo.init(jax.random.key(0), env, config)
+
+    @jit_unoptimized
+    def updated(critic_learning_rate):
+        changed = dataclasses.replace(config, critic_learning_rate=critic_learning_rate)
+        state = ppo.update(env, changed, before)[0]
+        return ravel_pytree(state.policy.params)[0], ravel_pytree(state.critic)[0]
+
+    critic_before = ravel_pytree(before.critic)[0]
+    (policy, critic), (same_policy, still), (_, other) = map(updated, (config.learning_rate, 1e-30, 1e-2))
+    np.testing.assert_allclose(still, critic_before, atol=1e-20)
+    np.testing.assert_allclose(same_policy, policy, rtol=1e-5)
+    changes = jnp.linalg.norm(other - critic_before) / jnp.linalg.norm(critic - critic_before)
+    assert changes == pytest.approx(1e-2 / config.learning_rate, rel=0.2)

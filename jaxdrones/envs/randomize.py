@@ -174,16 +174,16 @@ def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[boo
 
 def with_random_lags(randomize: Sequence[Randomization], params: Params) -> Params:
     """Parameters of a team with the shortest rotor lags of `realistic`, or those of 1,000 draws of the user's own."""
-    realistic = {name: lag for name, lag in _REALISTIC_LAGS.items() if lag in randomize}
-    params = params.replace(**{name: _LAGS[name][0] * getattr(params, name) for name in realistic})
+    drawn = dict(zip(_RANGES, REALISTIC_RANDOMIZATION, strict=True))
+    realistic = [name for name in _LAGS if drawn[name] in randomize]
+    params = params.replace(**{name: _RANGES[name][0] * getattr(params, name) for name in realistic})
     randomize = [one for one in randomize if one not in REALISTIC_RANDOMIZATION and not isinstance(one, AnyVehicle)]
-    names = tuple(_LAGS)
     random = jax.tree.unflatten(jax.tree.structure(params), drawn_leaves(randomize, params))
-    if not any(getattr(random, name) for name in names):
+    if not any(getattr(random, name) for name in _LAGS):
         return params
 
     def lags(key: jax.Array) -> dict[str, Array]:
-        return {name: getattr(draw(randomize, key, params), name) for name in names}
+        return {name: getattr(draw(randomize, key, params), name) for name in _LAGS}
 
     return params.replace(**jax.jit(jax.vmap(lags))(jax.random.split(jax.random.key(0), _DRAWS)))
 
@@ -249,17 +249,25 @@ def delayed(actions: Array, steps: float | Array) -> Array:
     return sum((share[:, i, None] * actions[:, i] for i in ages), jnp.zeros((), actions.dtype))
 
 
-_LAGS = {"rotor_rise_time": (0.8, 1.2), "rotor_fall_time": (0.2, 1.2)}
-_REALISTIC_LAGS = {name: scaled(name, *bounds) for name, bounds in _LAGS.items()}
-REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
-    scaled("mass", 0.9, 1.1),
-    scaled("inertia", 0.8, 1.2),
-    scaled("kf", 0.9, 1.1),
-    scaled("km", 0.2, 1.2),
-    scaled("rotor_pos", 0.95, 1.05),
-    scaled("drag_coeff", 0.5, 1.5),
-    *_REALISTIC_LAGS.values(),
-)
+_RANGES = {
+    "mass": (0.9, 1.1),
+    "inertia": (0.8, 1.2),
+    "kf": (0.9, 1.1),
+    "km": (0.2, 1.2),
+    "rotor_pos": (0.95, 1.05),
+    "drag_coeff": (0.5, 1.5),
+    "rotor_rise_time": (0.8, 1.2),
+    "rotor_fall_time": (0.2, 1.2),
+}
+_LAGS = "rotor_rise_time", "rotor_fall_time"
+
+
+def realistic_randomization(**ranges: tuple[float, float]) -> tuple[Randomization, ...]:
+    """`REALISTIC_RANDOMIZATION` with other ranges of some parameters: name=(low, high), relative to nominal values."""
+    return tuple(scaled(name, *bounds) for name, bounds in (_RANGES | ranges).items())
+
+
+REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = realistic_randomization()
 """Ranges of +-10 or 20 %, wider where published identifications of the Crazyflie differ more.
 
 Some find a fifth of the torque coefficient of `cf2x`; some find that rotors slow down as fast as they speed up, others

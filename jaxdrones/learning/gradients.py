@@ -90,13 +90,18 @@ def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
 
 def scale_gradient(tree: Any, factor: Scalar) -> Any:
     """Identity with the gradient multiplied by `factor`."""
+    return jax.tree.map(lambda x: _scaled(x, factor) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
-    def scale(x):
-        if not jnp.issubdtype(x.dtype, jnp.floating):
-            return x
-        return jax.lax.stop_gradient(x) + factor * (x - jax.lax.stop_gradient(x))
 
-    return jax.tree.map(scale, tree)
+@jax.custom_jvp
+def _scaled(x: Array, factor: Scalar) -> Array:
+    return x
+
+
+@_scaled.defjvp
+def _(arguments: tuple[Array, Scalar], changes: tuple[Array, Scalar]) -> tuple[Array, Array]:
+    (x, factor), (change, _) = arguments, changes
+    return x, jnp.asarray(factor, change.dtype) * change
 
 
 @jax.custom_vjp

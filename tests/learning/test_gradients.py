@@ -24,6 +24,8 @@ CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, hidden_sizes=(4,))
 def test_scaling_a_gradient_keeps_the_value():
     value, gradient = jax.value_and_grad(lambda x: scale_gradient({"x": x}, 0.5)["x"] ** 2)(3.0)
     assert value == 9 and gradient == 3
+    values = jnp.array([jnp.inf, -jnp.inf, 1.0])
+    np.testing.assert_array_equal(scale_gradient(values, 0.5), values)
 
 
 @pytest.mark.slow

@@ -8,6 +8,9 @@ from jaxtyping import ArrayLike
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import RunningStatistics
 
+_UNIT = 2.0**20  # of observations without statistics, so that none is clipped; a power of two does not round
+_COUNT = 2.0**40  # of observations in such statistics, more than any training adds
+
 
 def mlp_policy(
     layers: Sequence[tuple[ArrayLike, ArrayLike]],
@@ -24,14 +27,18 @@ def mlp_policy(
     Args:
         layers: weight (out, in) and bias (out,) of each linear layer; with `per_agent` a leading axis over drones.
         activation: a name of `learning.layers.ACTIVATIONS`, between the layers.
-        obs_stats: statistics for the normalization of observations; by default none.
+        obs_stats: statistics for the normalization of observations, which are clipped at ten standard deviations. By
+            default observations are not normalized, and not clipped: they are divided by 2^20 and the weights of the
+            first layer multiplied by it, which does not round. Training from such a policy keeps these statistics.
         per_agent: whether every drone has its own network.
     """
     weights = [(jnp.asarray(weight), jnp.asarray(bias)) for weight, bias in layers]
+    if obs_stats is None:
+        (first, bias), size = weights[0], weights[0][0].shape[-1]
+        weights[0] = first * _UNIT, bias
+        obs_stats = RunningStatistics(jnp.zeros(size), jnp.full(size, _UNIT**2), jnp.full((), _COUNT))
     params = {
         f"Dense_{i}": {"kernel": jnp.swapaxes(weight, -1, -2), "bias": bias} for i, (weight, bias) in enumerate(weights)
     }
     *hidden, outputs = (bias.shape[-1] for _, bias in weights)
-    if obs_stats is None:
-        obs_stats = RunningStatistics.empty(weights[0][0].shape[-1])
     return Policy({"params": params}, obs_stats, MLP(tuple(hidden), outputs, activation=activation), per_agent)

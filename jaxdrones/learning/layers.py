@@ -1,5 +1,6 @@
 """Network layers: multilayer perceptrons, convolutions of images, gated recurrent units."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,8 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import look_up
 from jaxdrones.envs.env import Obs, RowSet
+from jaxdrones.errors import UserError
+from jaxdrones.learning.normalize import CLIP
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
 _SMALL_IMAGE = 100  # pixels, below which a stride is 2 instead of 4
@@ -195,7 +198,16 @@ def make_network(
 
     `recurrent_size` is 0 without a GRU; `set_sizes` are those of the layers that encode a row of the sets in the
     observation.
+
+    Raises:
+        ValueError: a set with a finite reach beyond the range of positions that a network sees.
     """
+    for *_, reach in sets:
+        if CLIP < reach < math.inf:
+            raise UserError(
+                f"a set of the observation has a reach of {reach:g} m, and networks see positions up to {CLIP:g} m "
+                f"along each axis, so farther rows would count; give a reach of at most {CLIP:g} m"
+            )
     channels: tuple[int, ...] = ()
     strides: tuple[int, ...] = ()
     if isinstance(obs, dict):

@@ -11,7 +11,7 @@ from helpers import jit_unoptimized
 from jaxdrones import envs
 from jaxdrones.envs.observations import encounters, neighbors, obstacles
 from jaxdrones.learning import bptt, checkpoint
-from jaxdrones.learning.layers import SetEncoder, split_sets
+from jaxdrones.learning.layers import SetEncoder, make_network, split_sets
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.sensing import Cylinder, Scene, Sphere
@@ -48,6 +48,18 @@ def test_a_row_fades_out_without_a_jump():
         return np.linalg.norm(features(own, np.array([[away, 0.0, 0.0, 1.0, 1.0]])))
 
     assert size(REACH) < 1e-5 < size(0.99 * REACH) < 0.05 * size(0.3 * REACH)
+
+
+def test_a_drone_beyond_a_reach_is_not_seen_and_a_reach_that_networks_do_not_see_is_refused():
+    """Policies clip what they observe at 10, also the 20 m of a drone that does not exist."""
+    stats, rows = RunningStatistics.empty(13), np.random.default_rng(0).normal(size=(1, 3, 13))
+    rows[..., :3] = [[20, 0, 0], [0, -15, 3], [12, 12, 12]]
+    network = make_network(jnp.zeros(40), (4,), 2, 1.0, sets=((1, 3, 13, 10.0),), set_sizes=(8,))
+    params = jit_unoptimized(network.init)(KEY, jnp.zeros(40))
+    seen = jit_unoptimized(lambda rows: network.apply(params, jnp.append(1.0, stats.normalize(rows)))[1])
+    np.testing.assert_allclose(seen(rows), seen(2 * rows), atol=1e-6)
+    with pytest.raises(ValueError, match="has a reach of 20 m, and networks see positions up to 10 m"):
+        make_network(jnp.zeros(40), (4,), 2, 1.0, sets=((1, 3, 13, 20.0),), set_sizes=(8,))
 
 
 def test_sets_are_cut_out_of_an_observation_where_they_stand():

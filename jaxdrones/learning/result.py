@@ -156,12 +156,18 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
                 streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak, step - count)
             newest = with_unknown({name: x[0] for name, x in rows[-1].items()}) if callbacks else {}
             values = {name: x.item() for name, x in newest.items()}
-            stop = any([call(step, values, state) is True for call in callbacks])
+            stop = any([_is_true(call(step, values, state)) for call in callbacks])
         history = with_unknown({name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]})
         return Result(state.policy, state, history)
 
     train.__module__, train.__qualname__ = kind.__module__, "train"
     return checked(train)
+
+
+def _is_true(answer: Any) -> bool:
+    """Whether the answer of a callback is a true boolean, of Python, NumPy or JAX."""
+    is_array = isinstance(answer, np.bool_ | np.ndarray | jax.Array) and answer.dtype == bool and answer.ndim == 0
+    return bool(answer) if is_array else answer is True
 
 
 def _check_state(state: Any, init: Callable, network: Any) -> None:

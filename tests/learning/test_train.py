@@ -15,7 +15,7 @@ from double_integrator import SMALL, Cue, DoubleIntegrator
 from flax import nnx
 from helpers import jit_unoptimized, mostly_slow, name_of
 
-from jaxdrones.learning import bptt, checkpoint, loggers, ppo
+from jaxdrones.learning import bptt, checkpoint, loggers, ppo, result
 from jaxdrones.learning.networks import MLP, OwnNetwork, Policy
 
 KEY = jax.random.key(0)
@@ -228,6 +228,17 @@ def test_a_state_that_does_not_fit_is_refused():
 def test_a_callback_that_is_no_function_is_refused():
     with pytest.raises(ValueError, match=r"callback is \[3\]; give functions"):
         bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], callback=[3])
+
+
+def test_a_true_boolean_of_any_library_stops_a_training_and_no_other_answer_does():
+    def update(env, config, state):
+        return state.replace(step=state.step + 1), {"nonfinite_gradients": jnp.zeros((), int)}
+
+    env, train = DoubleIntegrator(), result.make_train(bptt.Config, bptt.init, update)
+    answers = (True, 1), (np.True_, 1), (jnp.array(True), 1), (False, 3), (np.False_, 3), (None, 3), (1, 3), ("yes", 3)
+    for answer, updates in (*answers, (np.ones(2), 3)):
+        trained = train(KEY, env, SMALL[bptt], callback=lambda *_, answer=answer: answer)
+        assert int(trained.train_state.step) == updates, answer
 
 
 def test_the_log_of_a_continued_training_keeps_the_rows_of_earlier_updates(tmp_path):

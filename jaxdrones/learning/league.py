@@ -6,7 +6,7 @@ part of the training state. So a whole training is one compiled program.
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,11 @@ class TrainState(result.TrainState):
 
     past: Policy
     """Past policies, (k, ...)."""
+
+    def with_policy(self, policy: Policy) -> Self:
+        """State before the first update of a training that starts from a policy, which is also all past policies."""
+        past = jax.tree.map(lambda old, x: jnp.broadcast_to(x, old.shape), self.past, policy)
+        return self.replace(policy=policy, past=past)
 
 
 def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,10 @@ class TrainState(PyTreeNode):
     policy: Policy
     opt_state: optax.OptState
     worlds: collect.Worlds
+
+    def with_policy(self, policy: Policy) -> Self:
+        """State before the first update of a training that starts from a policy."""
+        return self.replace(policy=policy)
 
 
 Settings = TypeVar("Settings", bound=Config, contravariant=True)

@@ -23,8 +23,8 @@ ALGORITHMS = {
 class Learner(Protocol):
     """Interface of a learner module.
 
-    Its `Config` is a frozen dataclass with at least `updates`, `worlds` and `horizon`. Its training state is a pytree
-    with at least `step`, `policy` and `worlds`. The metrics of an update include `nonfinite_gradients`, the number of
+    Its `Config` is a frozen dataclass with at least `updates`, `worlds` and `horizon`. Its training state is a
+    `jaxdrones.learning.result.TrainState`. The metrics of an update include `nonfinite_gradients`, the number of
     gradients that are not finite.
     """
 

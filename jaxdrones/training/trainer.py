@@ -76,10 +76,11 @@ class Trainer:
         state = self._start(key)
         if self.first_policy is None:
             return state
-        put = jax.tree.map(
-            lambda x, own: jax.device_put(x.astype(own.dtype), own.sharding), self.first_policy, state.policy
-        )
-        return state.replace(policy=put)
+
+        def put(x: Any, own: Any) -> Any:
+            return own if x is own else jax.device_put(x.astype(own.dtype), own.sharding)
+
+        return jax.tree.map(put, state.with_policy(self.first_policy), state)
 
     def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
         """Run at most `MAX_CALL` updates in one call: the next state, and (updates,) of every metric."""

@@ -33,6 +33,15 @@ def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_pol
     np.testing.assert_allclose(action[2:, 1:], act(scaled(policy, -3.0))[2:, 1:], rtol=1e-6)
 
 
+def test_a_training_from_a_policy_begins_against_that_policy():
+    env = jd.make("hover", drones=2)
+    first = scaled(jit_unoptimized(lambda: league.init(KEY, env, CONFIG).policy)(), 2.0)
+    with_first = jit_unoptimized(lambda first: league.init(KEY, env, CONFIG).with_policy(first))(first)
+    assert_close(with_first.policy, first, 0)
+    for i in range(CONFIG.past_policies):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], with_first.past), first, 0)
+
+
 @pytest.mark.slow
 def test_a_league_of_single_drones_learns_what_bptt_learns():
     env = jd.make("hover")

@@ -107,7 +107,9 @@ class _Loop:
             self.state = sharding.shard_state(trainer.mesh, _load(trainer, run))
             self.update = int(self.state.step)
             about, best = run.sidecar("state"), run.sidecar_entry("best", "score")
-            self.id, self.seconds, self.reached = about["run_id"], about["seconds"], about["reached"]
+            self.id, self.seconds = about["run_id"], about["seconds"]
+            same_rate = about["recipe"]["stop_at"] == trainer.recipe.stop_at
+            self.reached = about["reached"] if same_rate else 0
             self.best, self.highest_success = (best[0], best[1]), max(best[0], about["highest_success"])
             self.last_evaluation_seconds = about["evaluation_seconds"]
             self.evaluation_seconds = about.get("evaluating", 0.0)

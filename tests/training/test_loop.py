@@ -129,6 +129,19 @@ def test_a_training_stops_after_three_evaluations_in_a_row_that_reach_its_rate(r
     assert run.recipe().stop_at == rate and trainer.recipe.config.updates == 6
 
 
+def test_evaluations_that_reached_another_rate_do_not_count(trainer, tmp_path, monkeypatch):
+    """A training that stopped at a low rate and is continued with a higher one needs three evaluations at that one."""
+    evaluate = trainer.evaluate
+    monkeypatch.setattr(trainer, "evaluate", lambda *of: evaluate(*of).replace(success_interval=(0.5, 1.0)))
+    run, stopped = Run(tmp_path), []
+    for rate, updates in (0.3, 6), (0.4, 12):
+        config = dataclasses.replace(trainer.recipe.config, updates=updates)
+        monkeypatch.setattr(trainer, "recipe", dataclasses.replace(trainer.recipe, config=config, stop_at=rate))
+        loop.train(trainer, run, 3, lambda *_: None)
+        stopped.append(run.report()["updates"])
+    assert stopped == [2, 5]  # with an evaluation after every update, also of the untrained policy
+
+
 def test_a_rate_that_no_evaluation_reaches_is_refused():
     for rate, has_success, episodes, message in [
         (0.99, True, 100, "begins at 0.9630; give at least 381 episodes"),

@@ -50,8 +50,8 @@ def batch_of(
     next_value = _next_value(config, state, trajectory, value, noise)
     advantage = advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
     valid = ~trajectory.was_done if ends_alone else None
-    centered = advantage - sharding.mean_over_devices(jnp.mean(advantage, where=valid))
-    std = jnp.sqrt(sharding.mean_over_devices(jnp.mean(centered**2, where=valid)))
+    centered = advantage - sharding.mean_over_devices(sharding.share_of_mean(advantage, valid))
+    std = jnp.sqrt(sharding.mean_over_devices(sharding.share_of_mean(centered**2, valid)))
     return Batch(
         obs=map_state_vector(policy.obs_stats.normalize, trajectory.obs),
         action=trajectory.action,

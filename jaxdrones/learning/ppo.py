@@ -159,18 +159,19 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
     """Clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy.
 
     The metrics are the error of the values and the Kullback-Leibler divergence from the behavior policy, by a
-    non-negative estimate.
+    non-negative estimate. On several devices these are shares, see `sharding.share_of_mean`.
     """
     mean = policy.replay(jax.tree.map(lambda x: x[0], batch.hidden_state), batch.obs, batch.starts)
     log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
-    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage), where=batch.valid)
+    mean_of = functools.partial(sharding.share_of_mean, where=batch.valid)
+    surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     value_error = (1 - config.gamma) * (discounted_value(config, critic, batch.critic_obs) - batch.value_target)
-    value_loss = jnp.mean(value_error**2, where=batch.valid)
+    value_loss = mean_of(value_error**2)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + HALF_LOG_2_PI, axis=-1))
     total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
-    return total, {"value_loss": value_loss, "kl": jnp.mean(ratio - 1 - log_ratio, where=batch.valid)}
+    return total, {"value_loss": value_loss, "kl": mean_of(ratio - 1 - log_ratio)}
 
 
 def _most_truncations(env: Env, horizon: int) -> int:

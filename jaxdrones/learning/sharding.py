@@ -16,8 +16,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
 
 from jaxdrones.errors import UserError
 
@@ -85,6 +87,16 @@ def mean_over_devices(tree: Any) -> Any:
         return tree
     flat, unflatten = ravel_pytree(tree)
     return unflatten(jax.lax.pmean(flat, _AXIS))
+
+
+def share_of_mean(x: Array, where: Array | None = None) -> Array:
+    """Number of each device whose mean over devices is the mean of the entries of all devices `where` a mask holds.
+
+    The mean over devices of their own means would give an entry more weight on a device with fewer of them.
+    """
+    if where is None:
+        return jnp.mean(x)
+    return jnp.sum(x, where=where) / mean_over_devices(jnp.sum(where, dtype=x.dtype))
 
 
 def gather(mesh: Mesh, tree: Any) -> Any:

@@ -11,7 +11,7 @@ from helpers import jit_unoptimized
 from jax.flatten_util import ravel_pytree
 
 import jaxdrones as jd
-from jaxdrones.learning import ppo
+from jaxdrones.learning import ppo, sharding
 
 
 @pytest.mark.parametrize("advantage", [1.0, -1.0])
@@ -55,3 +55,21 @@ def test_the_critic_learns_at_its_own_rate_and_the_policy_as_before():
     np.testing.assert_allclose(same_policy, policy, rtol=1e-5)
     changes = jnp.linalg.norm(other - critic_before) / jnp.linalg.norm(critic - critic_before)
     assert changes == pytest.approx(1e-2 / config.learning_rate, rel=0.2)
+
+
+def test_a_step_that_counts_has_the_same_weight_on_every_device(monkeypatch):
+    """Two devices, emulated by `vmap`, of which one has a single valid step: drones of the others have ended."""
+    config = ppo.Config()
+    monkeypatch.setattr(ppo, "discounted_value", lambda config, critic, obs: obs)
+    policy, log_std = SimpleNamespace(replay=lambda memory, obs, starts: obs), jnp.zeros(1)
+    keys = jax.random.split(jax.random.key(0), 5)
+    obs, action = (jax.random.normal(key, (2, 3, 1)) for key in keys[:2])
+    log_prob, value, advantage = (jax.random.normal(key, (2, 3)) for key in keys[2:])
+    valid = jnp.array([[True, True, True], [False, True, False]])
+    batch = ppo.Batch(obs, action, log_prob - 1, value, advantage, -value, valid=valid)
+    loss = jit_unoptimized(lambda batch: ppo.loss(config, policy, log_std, None, batch))
+    expected = loss(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), batch))
+    monkeypatch.setattr(sharding, "mean_over_devices", lambda tree: jax.lax.pmean(tree, "devices"))
+    shares = jax.vmap(lambda batch: ppo.loss(config, policy, log_std, None, batch), axis_name="devices")(batch)
+    for mean, one in zip(jax.tree.leaves(shares), jax.tree.leaves(expected), strict=True):
+        assert jnp.mean(mean) == pytest.approx(one.item(), rel=1e-5)

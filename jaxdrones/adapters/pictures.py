@@ -34,7 +34,7 @@ def of_world(env: Env, world: World) -> np.ndarray:
     """Picture of a team, RGB (480, 640, 3) uint8, by the explicit renderer, or by Bullet on its backend."""
     if not isinstance(env.physics, HostStep):
         return np.array(_picture(world))
-    eye, center = map(np.asarray, _side(world.drones.pos))
+    eye, center = map(np.asarray, _side(world))
     bullet: Any = env.physics
     return bullet.photo(world.params, world.drones, eye, center, _CAMERA, scene=world.scene)
 
@@ -47,15 +47,19 @@ def of_worlds(env: Env, worlds: World) -> np.ndarray:
     return np.stack([of_world(env, jax.tree.map(lambda x, i=i: x[i], worlds)) for i in range(count)])
 
 
-def _side(pos: Float[Array, "n 3"]) -> tuple[Array, Array]:
-    """Position of a camera that sees the whole team, and the middle of the team, m, world."""
-    center = jnp.mean(pos, axis=0)
-    reach = 1.0 + jnp.max(jnp.abs(pos - center[None]))
+def _side(world: World) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Position of a camera that sees the whole team, and the middle of the team, m, world.
+
+    Drones that left the world, which are far away, do not count, unless all have left.
+    """
+    pos, shown = world.drones.pos, (world.active | ~jnp.any(world.active))[:, None]
+    center = jnp.mean(pos, axis=0, where=shown)
+    reach = 1.0 + jnp.max(jnp.where(shown, jnp.abs(pos - center[None]), 0))
     return center + reach * jnp.asarray(_DIRECTION, pos.dtype), center
 
 
-def _of(world: Any) -> Array:
-    return photograph(world.scene, world.params, world.drones, *_side(world.drones.pos), _CAMERA)
+def _of(world: World) -> Array:
+    return photograph(world.scene, world.params, world.drones, *_side(world), _CAMERA)
 
 
 _picture = jax.jit(_of)

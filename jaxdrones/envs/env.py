@@ -226,7 +226,8 @@ class Env:
             The observation; the world; the reward (n,); terminated (), whether the episode ended in a terminal state;
             truncated (), whether it was cut off; and info (n,): `rewards`, `metrics`, `terminations` and `truncations`
             by name; `terminated` and `truncated`, whether the episode of each drone ended in this step; and `active`,
-            whether it had not ended before. After its end the reward of a drone is zero; see `Task.ends`.
+            whether it had not ended before. After its end the reward of a drone is zero, and its metrics have no
+            meaning; see `Task.ends`.
 
         Raises:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).

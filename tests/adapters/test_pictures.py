@@ -1,5 +1,7 @@
 """Pictures from the side show what is there, of one world and of many."""
 
+from types import SimpleNamespace
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
+from jaxdrones.adapters import pictures
 from jaxdrones.adapters.gymnasium import GymnasiumEnv, VectorEnv
 from jaxdrones.sensing import Camera, Scene, Sphere, photograph
 
@@ -38,6 +41,17 @@ def test_a_compiled_photograph_in_float32_leaves_one_in_float64_as_it_is():
     with jax.enable_x64(False):
         compiled = jax.jit(taken)(jnp.array([0.0, 0, 5]))
     np.testing.assert_array_equal(taken(jnp.array([0.0, 0, 5])), compiled)
+
+
+def test_a_picture_is_of_the_drones_that_are_still_in_the_world():
+    def camera(pos, active):
+        return pictures._side(SimpleNamespace(drones=jd.State.at_rest(jnp.array(pos)), active=jnp.array(active)))
+
+    near, left = [[0.0, 1, 2], [1.0, 0, 3]], [1e4, 0, 1e4]
+    expected = camera(near, [True, True])
+    for found in camera([*near, left], [True, True, False]), camera([left, *near], [False, True, True]):
+        np.testing.assert_allclose(found, expected)
+    np.testing.assert_allclose(camera(near, [False, False]), expected)
 
 
 @pytest.mark.slow

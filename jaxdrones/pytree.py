@@ -36,5 +36,5 @@ def _from_bytes(data: bytes | bytearray) -> Any:
 
 
 def as_tuple(value: Any) -> Any:
-    """Convert JSON's lists back to tuples."""
-    return tuple(map(as_tuple, value)) if isinstance(value, list) else value
+    """Convert lists, which JSON has in place of tuples, to tuples."""
+    return tuple(map(as_tuple, value)) if isinstance(value, list | tuple) else value

@@ -5,6 +5,7 @@ import contextlib
 import csv
 import io
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from jaxdrones.cli import main
 from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
 from jaxdrones.cli.settings import with_config
+from jaxdrones.cli.train_request import Request
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training import trainer
@@ -96,6 +98,12 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
     capsys.readouterr()
     assert main(["train", "hover", "--output", str(folder), "--resume"]) == 2
     assert "is complete" in capsys.readouterr().err
+
+
+def test_the_command_that_continues_a_training_can_be_pasted_whatever_its_names_are():
+    request = Request(task="my tasks.py:box", output=Path("runs/hidden_sizes=(8,8)/a b"), seed=4, seeds=2)
+    words = ["train", "my tasks.py:box", "--output", "runs/hidden_sizes=(8,8)/a b", "--resume", "--seeds", "2"]
+    assert shlex.split(request.again) == ["jaxdrones", *words, "--seed", "4"]
 
 
 def contents(folder):
@@ -203,7 +211,7 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
         assert message in capsys.readouterr().err
     assert contents(folder) == before
 
-    assert main([*resume, "--budget", "2"]) == 0
+    assert main([*resume, "--budget", "2", "--set", "hidden_sizes=[8]"]) == 0  # a list or a tuple is the same
     assert "updates: 6, 4 of them made" in capsys.readouterr().out
     assert Run(folder).report()["updates"] == 6 == Run(folder).sidecar_entry("state", "update")
     assert rewards(folder)[:4] == rewards(trained[0]) and len(rewards(folder)) == 6
@@ -324,6 +332,9 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--sweep", "horizon"], "give NAME=VALUE,VALUE"),
         (["train", "hover", "--log", "tensorboard,csv"], "give names of tensorboard, wandb, mlflow"),
         (["train", "hover", "--sweep", "horizon=2,3", "--set", "horizon=2"], "given by --set and by --sweep"),
+        (["train", "hover", "--sweep", "horizon=2", "--sweep", "horizon=3"], "--sweep horizon is given twice"),
+        (["train", "hover", "--sweep", "gamma=0.9,0.99,0.90"], "--sweep has gamma=0.9 twice"),
+        (["train", "hover", "--sweep", "gamma=0.9,2"], "gamma is 2.0; give a number of at least 0 and at most 1"),
         (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config=none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config", "none.toml", "--config=none.toml"], "--config is given twice"),

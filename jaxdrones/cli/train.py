@@ -152,6 +152,9 @@ def _train(options: argparse.Namespace) -> int:
         if not options.no_figure:
             plots.check_matplotlib()
         requests = Request.of(options).swept()
+        for request in requests if len(requests) > 1 else ():  # a mistake in the last one is found before the first
+            with user_mistakes(request.settings, request.task):
+                request.recipe(request.runs())
     for request in requests:
         code = _train_row(request, begin)
         if code:

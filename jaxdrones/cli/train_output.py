@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -179,6 +180,6 @@ def show_results(request: Request, runs: dict) -> int:
         )
         print(evaluation_table(report["evaluation"]))
     print("wrote " + ", ".join(map(str, files)))
-    print(f"fly it: jaxdrones fly --policy {output}")
+    print(f"fly it: {shlex.join(['jaxdrones', 'fly', '--policy', str(output)])}")
     warn_of_failure(run, reports[best])
     return 0

@@ -4,6 +4,7 @@ import argparse
 import ast
 import dataclasses
 import itertools
+import shlex
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,6 +16,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning.loggers import logger_names
 from jaxdrones.learning.networks import Policy
 from jaxdrones.limits import LARGEST_COUNT
+from jaxdrones.pytree import as_tuple
 from jaxdrones.training import user_files
 from jaxdrones.training.presets import default_algorithm
 from jaxdrones.training.recipe import Recipe
@@ -52,17 +54,21 @@ class Request(argparse.Namespace):
     def swept(self) -> list[Self]:
         """Request for each combination of the values of --sweep, each with its own folder."""
         rows = [parse_sweep(text) for text in self.sweep]
-        for name, _ in rows:
+        names = [name for name, _ in rows]
+        for name in names:
             if name in self.settings:
                 raise UserError(f"{name} is given by --set and by --sweep; give one of them")
+            if names.count(name) > 1:
+                raise UserError(f"--sweep {name} is given twice; give all values in one, {name}=VALUE,VALUE")
         if not rows:
             return [self]
-        names = [name for name, _ in rows]
-        requests = []
+        requests: list[Self] = []
         for values in itertools.product(*(values for _, values in rows)):
             settings = dict(zip(names, values, strict=True))
             row = ",".join(f"{name}={x}".replace(" ", "").replace("/", "-") for name, x in settings.items())
             own = {"settings": self.settings | settings, "output": self.output / row, "row": row}
+            if any(own["output"] == other.output for other in requests):
+                raise UserError(f"--sweep has {row} twice, which would train into the same folder; give it once")
             requests.append(type(self)(**vars(self) | own))
         return requests
 
@@ -77,7 +83,7 @@ class Request(argparse.Namespace):
     @property
     def again(self) -> str:
         """Command that continues this training."""
-        command = f"jaxdrones train {self.task} --output {self.output} --resume"
+        command = shlex.join(["jaxdrones", "train", self.task, "--output", str(self.output), "--resume"])
         first = min(self.folders)
         return command + f" --seeds {self.seeds}" * (self.seeds > 1) + f" --seed {first}" * (first > 0)
 
@@ -140,7 +146,7 @@ class Request(argparse.Namespace):
             had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": self.seed}
         updates = wanted.pop("updates", None)
         for name, x in wanted.items():
-            if had.get(name) != x:
+            if as_tuple(had.get(name)) != as_tuple(x):
                 raise UserError(
                     f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume"
                 )

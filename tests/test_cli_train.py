@@ -274,6 +274,29 @@ def test_gradients_that_are_not_finite_stop_training_though_nothing_else_shows_t
 
 
 @pytest.mark.slow
+def test_every_seed_is_logged_as_a_run_of_its_own(monkeypatch, tmp_path):
+    """By a logger that, as W&B and MLflow, has one active run."""
+    active, logged = [], {}
+
+    class Logger:
+        def __init__(self, folder):
+            assert not active
+            active.append(folder.name)
+
+        def __call__(self, update, metrics, state):
+            logged.setdefault(active[0], []).append(update)
+
+        def close(self):
+            active.clear()
+
+    monkeypatch.setitem(loggers._NAMED, "tensorboard", Logger)
+    monkeypatch.setitem(loggers._LIBRARIES, "tensorboard", "json")
+    command = [*TRAIN, "--seeds", "2", "--no-figure", "--json", "--log", "tensorboard", "--output", str(tmp_path)]
+    assert main(command) == 0 and not active
+    assert logged == {"seed-0": [0, 1, 2, 3, 4], "seed-1": [0, 1, 2, 3, 4]}
+
+
+@pytest.mark.slow
 def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     arguments = [
         "train",

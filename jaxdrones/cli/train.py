@@ -182,15 +182,13 @@ def _train_row(request: Request, begin: float) -> int:
 def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines) -> int:
     print_line = train_output.quiet if request.json else print
     config, what = trainer.recipe.config, described(trainer.recipe) + f", {request.row}" * bool(request.row)
-    loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
     _compile(request, runs, trainer, what, print_line)
     deadlines.start()
-    if not request.resume:
-        for run in (*runs.values(), Run(request.output)):
-            run.clear()
+    replaced = [] if request.resume else [*runs.values(), Run(request.output)]
+    to_train = remaining(runs, config.updates, request.seconds) if request.resume else runs
 
     with live_server(request.live, request.json) as live:
-        for seed, run in remaining(runs, config.updates, request.seconds).items():
+        for seed, run in to_train.items():
             label = f"seed {seed}" if len(runs) > 1 else "training"
             display = train_output.ProgressDisplay(_updates(request, config), label, trainer.episodes, print_line)
             on_progress: Callable = display.update
@@ -198,8 +196,10 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
                 title = what + f", seed {seed}" * (len(runs) > 1)
                 on_progress = show_training(live, trainer, run, title, on_progress)
             try:
-                with display:
-                    loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed], request.keep_history)
+                with named_loggers(request.log, run.folder) as loggers, display:
+                    while replaced:  # the first loggers have started
+                        replaced.pop().clear()
+                    loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers, request.keep_history)
             except KeyboardInterrupt:
                 return _interrupted(request, seed, run)
             except Diverged as error:

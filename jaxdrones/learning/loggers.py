@@ -3,10 +3,11 @@
 A logger is a function `(update, metrics, state)`, with the number of updates so far.
 """
 
+import contextlib
 import csv
 import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,16 @@ class TensorBoard:
             self._writer.add_scalar(name, value, update)
         self._writer.flush()
 
+    def close(self) -> None:
+        """Close the file."""
+        self._writer.close()
+
 
 class WandB:
-    """Log to Weights & Biases; the keyword arguments are those of `wandb.init`."""
+    """Log to Weights & Biases; the keyword arguments are those of `wandb.init`.
+
+    Close it before the next training, which otherwise logs into the same run.
+    """
 
     def __init__(self, **options: Any):
         self.run = _library("wandb").init(**options)
@@ -76,9 +84,16 @@ class WandB:
         """Log the metrics of an update."""
         self.run.log(metrics, step=update)
 
+    def close(self) -> None:
+        """Finish the run."""
+        self.run.finish()
+
 
 class MLflow:
-    """Log to MLflow; the keyword arguments are those of `mlflow.start_run`."""
+    """Log to MLflow; the keyword arguments are those of `mlflow.start_run`.
+
+    Close it before the next training, as MLflow refuses a second active run.
+    """
 
     def __init__(self, **options: Any):
         self._mlflow = _library("mlflow")
@@ -87,6 +102,10 @@ class MLflow:
     def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
         """Log the metrics of an update."""
         self._mlflow.log_metrics(metrics, step=update, run_id=self.run.info.run_id)
+
+    def close(self) -> None:
+        """End the run."""
+        self._mlflow.end_run()
 
 
 class KeepBest:
@@ -123,18 +142,28 @@ _NAMED: dict[str, Callable[[Path], Any]] = {
 }
 
 
+_LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
+
+
 def logger_names(names: str | None) -> list[str]:
-    """The names in a text such as `tensorboard,wandb`; none for `None`."""
+    """The names in a text such as `tensorboard,wandb`, whose libraries are installed; none for `None`."""
     wanted = names.split(",") if names else []
     for name in wanted:
         if name not in _NAMED:
             raise UserError(f"--log is {names!r}; give names of {', '.join(_NAMED)}, for example --log tensorboard")
+    for name in wanted:
+        _library(_LIBRARIES[name])
     return wanted
 
 
-def named_loggers(names: str | None, folder: Path) -> list[Any]:
-    """The loggers of a run, for names as of `logger_names`; `folder` is that of the run."""
-    return [_NAMED[name](folder) for name in logger_names(names)]
+@contextlib.contextmanager
+def named_loggers(names: str | None, folder: Path) -> Iterator[list[Any]]:
+    """Context of the loggers of a run, for names as of `logger_names`; `folder` is that of the run.
+
+    They are closed at its end: W&B and MLflow have one active run at a time.
+    """
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(contextlib.closing(_NAMED[name](folder))) for name in logger_names(names)]
 
 
 def _library(name: str) -> Any:

@@ -1,5 +1,6 @@
 """`train` with a user's own network, callbacks, loggers, and a state to continue from."""
 
+import contextlib
 import csv
 import dataclasses
 import itertools
@@ -177,6 +178,43 @@ def test_loggers_write_every_update(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ValueError, match="wandb is not installed; run: pip install wandb"):
         loggers.WandB()
+
+
+class OneActiveRun:
+    """Like MLflow, which refuses a second active run, and W&B, which returns the active one in its place."""
+
+    def __init__(self):
+        self.finished, self.active = {}, None
+
+    def start_run(self, run_name):
+        assert self.active is None, "a run is already active"
+        self.active, self.finished[run_name] = types.SimpleNamespace(info=types.SimpleNamespace(run_id=run_name)), []
+        return self.active
+
+    def log_metrics(self, metrics, step, run_id):
+        self.finished[run_id].append(step)
+
+    def end_run(self):
+        self.active = None
+
+    def init(self, project, name):
+        if self.active is None:
+            self.finished[name] = []
+            self.active = types.SimpleNamespace(
+                log=lambda metrics, step: self.finished[name].append(step), finish=self.end_run
+            )
+        return self.active
+
+
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_the_logs_of_two_seeds_are_two_runs_also_after_a_seed_that_failed(name, monkeypatch):
+    library = OneActiveRun()
+    monkeypatch.setitem(sys.modules, name, library)
+    for folder in "seed-0", "seed-1":
+        with contextlib.suppress(KeyboardInterrupt), loggers.named_loggers(name, folder) as (logger,):
+            logger(1, {"reward": 1.0})
+            raise KeyboardInterrupt
+    assert library.finished == {"seed-0": [1], "seed-1": [1]} and library.active is None
 
 
 @pytest.mark.needs("tensorboardX")

@@ -129,6 +129,8 @@ def test_a_run_of_user_files_refuses_what_has_changed(here, capsys):
         (["train", "hover", "--vehicle", "missing.urdf"], "missing.urdf: cannot be read"),
         (["train", "my_task.py:moving_box", "--resume"], "runs/moving_box holds no training to continue"),
         (["explain", "missing.py:f"], "missing.py: cannot be read"),
+        (["fly", "circle", "--controller", "my_policy.py"], "my_policy.py defines no 'gains'"),
+        (["compare", "circle", "--controllers", "pid,old/pid.py"], "two controllers named 'pid'; rename one"),
     ],
 )
 def test_a_mistake_with_user_files_is_one_line(arguments, message, here, capsys):

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -88,6 +89,10 @@ FLIGHTS = {
         "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"
     ),
     "demo": Short(r"wrote runs/demo\.html \(2\.\d MB\)", "--no-open"),
+    "fly circle --controller my_controller.py": Short(rf"circle: 4 x cf2x, my_controller\.py ... {LOGGED}", FLIGHT),
+    "compare circle --controllers geometric,my_controller.py": Short(
+        r"circle: geometric, my_controller, largest ... my_controller +0\.\d+", FLIGHT
+    ),
     "list": Short("flights +circle, velocity ... vehicles +agilicious, bebop, cf21, cf21_brushless"),
 }
 FLIGHTS |= {
@@ -190,6 +195,9 @@ def test_what_sets_the_project_up_is_there():
 )
 def test_a_flight_of_a_page_prints_what_it_is_for(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    if "my_controller.py" in command:
+        own = next(b for b in blocks(ROOT / "docs" / "controllers.md", "python") if "def control" in b.code)
+        Path("my_controller.py").write_text(own.code)
     tried(command, FLIGHTS[command], capsys)
 
 

@@ -15,6 +15,7 @@ from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import save_npz
 from jaxdrones.flights.log import FlightLog
+from jaxdrones.user_code import is_reference
 from jaxdrones.visualization import comparison
 
 _BACKENDS = "explicit,bullet"
@@ -34,7 +35,8 @@ def add(commands) -> None:
     compared = parser.add_argument_group("comparison")
     files = parser.add_argument_group("files and output")
     option(compared, "--backends A,B", f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
-    option(compared, "--controllers A,B", f"in place of --backends: two or more of {', '.join(CONTROLLERS)}")
+    text = f"in place of --backends: two or more of {', '.join(CONTROLLERS)}, or .py files"
+    option(compared, "--controllers A,B", text)
     add_output(files, "folder of figure and logs (none)")
     add_no_figure(files)
     parser.set_defaults(run=_compare)
@@ -85,7 +87,12 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
         raise UserError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
     feedforward = options.feedforward is not False and options.flight != "velocity"
     same = vars(options) | {"feedforward": feedforward}
-    return "controllers", {name: (argparse.Namespace(**same | {"controller": name}), "explicit") for name in names}
+    labels = [Path(name).stem if is_reference(name) else name for name in names]
+    twice = next((label for label in labels if labels.count(label) > 1), None)
+    if twice is not None:
+        raise UserError(f"--controllers has two controllers named {twice!r}; rename one of the files")
+    flown = (argparse.Namespace(**same | {"controller": name}) for name in names)
+    return "controllers", {label: (case, "explicit") for label, case in zip(labels, flown, strict=True)}
 
 
 def _names(option: str, text: str) -> list[str]:

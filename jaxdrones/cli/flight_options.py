@@ -9,9 +9,11 @@ from jaxdrones.cli.common import bar, print_error
 from jaxdrones.cli.options import add_drones, add_vehicle, option, split_names
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
+from jaxdrones.flights.controllers import module_of
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.urdf import load_params
+from jaxdrones.user_code import is_reference
 
 CONDITIONS = ("effects", "controller", "feedforward", "control_hz", "duration", "rotors", "integrator")
 """Options of an example; with a policy they are those of its task."""
@@ -23,7 +25,7 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     add_drones(group)
     add_vehicle(group, "cf2x")
     option(group, "--effects A,B", f"{', '.join(EFFECTS | PAIRS)}, or none")
-    option(group, "--controller NAME", "{} (the vehicle's own)", known=CONTROLLERS)
+    option(group, "--controller NAME|FILE", "{}, or your own in a .py file (the vehicle's own)", known=CONTROLLERS)
     group.add_argument(
         "--feedforward",
         action=argparse.BooleanOptionalAction,
@@ -48,6 +50,8 @@ def check_conditions(options: argparse.Namespace, **more) -> None:
     """Raise `ValueError` for invalid options of a flight."""
     conditions = Conditions(options.flight, **_conditions(options), **more)
     load_params(conditions.vehicle)
+    if is_reference(controller := str(conditions.controller)):
+        module_of(controller)
 
 
 def _conditions(options: argparse.Namespace) -> dict[str, Any]:

@@ -8,11 +8,13 @@ from typing import Annotated
 
 from jaxdrones import arguments, control, optimal
 from jaxdrones.arguments import Count, Seconds, Switch, checked, choice, choices, whole
+from jaxdrones.checks import hint
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.errors import UserError
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.limits import check_memory
+from jaxdrones.user_code import is_reference
 
 BACKENDS = ("explicit", "bullet")
 CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
@@ -24,6 +26,15 @@ _MAX_HZ = 20_000  # above it a step of 1 mm/s is below the rounding of a float32
 _MAX_DURATION = 1e5  # s; beyond, the resolution of float32 times is coarser than control steps at 120 Hz
 _LOG_BYTES = 400  # per drone and control step: trajectory, log, figure
 _PAIR_BYTES = 32  # per pair of drones, while the effects between them are summed
+
+
+def _check_controller(argument: str, name: str) -> None:
+    if is_reference(name):
+        if not name.endswith(".py"):
+            raise UserError(f"controller is {name!r}; give the whole file, {name.partition(':')[0]!r}")
+    elif name not in CONTROLLERS:
+        known = ", ".join(CONTROLLERS)
+        raise UserError(f"unknown controller {name!r}{hint(name, CONTROLLERS)} (known: {known}, or a .py file)")
 
 
 @checked
@@ -38,8 +49,8 @@ class Conditions:
     drones: Count | None = None
     effects: Annotated[tuple[str, ...] | None, choices("effect", EFFECTS | PAIRS, "'drag'")] = None
     """Names of `EFFECTS` and `PAIRS`."""
-    controller: Annotated[str | None, choice("controller", CONTROLLERS)] = None
-    """A name of `CONTROLLERS`; by default the vehicle's."""
+    controller: Annotated[str | None, _check_controller] = None
+    """A name of `CONTROLLERS`, or the path of a file with `gains`, `init` and `control`; by default the vehicle's."""
     feedforward: Switch | None = None
     """Whether the controller receives velocity and acceleration of the target beside position and heading. By default
     all but `pid` do: the examples of gym-pybullet-drones (2021) command positions alone."""

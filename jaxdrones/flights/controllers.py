@@ -2,23 +2,29 @@
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxdrones import control, optimal
-from jaxdrones.control import firmware_pid, for_team, mellinger, mrac, pid, velocity
+from jaxdrones import optimal
+from jaxdrones.checks import bind, check_function, takes
+from jaxdrones.control import CONTROLLERS, firmware_pid, for_team, mellinger, mrac, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
 from jaxdrones.engine.explicit import make_step
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.urdf import load_params
+from jaxdrones.user_code import definition, is_reference, read_text
 
 _SCALED = (firmware_pid, mellinger)  # to vehicles other than the Crazyflie
+_ARGUMENTS = {"gains": (), "init": (), "control": ("gains", "params", "memory", "state", "setpoint")}
 
 
 class Controller(NamedTuple):
@@ -35,7 +41,7 @@ def controller_of(conditions: Conditions) -> Controller:
     if conditions.controller in optimal.CONTROLLERS:
         return _optimal(conditions)
     n = conditions.drones
-    module = velocity if conditions.flight == "velocity" else control.CONTROLLERS[conditions.controller]
+    module = velocity if conditions.flight == "velocity" else module_of(conditions.controller)
     if module in (pid, velocity):
         gains = pid.gains(conditions.vehicle)
     elif module is mrac or (module in _SCALED and conditions.vehicle not in pid.VEHICLES):
@@ -49,6 +55,19 @@ def controller_of(conditions: Conditions) -> Controller:
         return jax.vmap(one)(params, memory, state, setpoints(conditions, t))
 
     return Controller(lambda params, start: memory, fly)
+
+
+def module_of(name: str) -> Any:
+    """Controller by its name, or of a user's file, validated."""
+    if not is_reference(name):
+        return CONTROLLERS[name]
+    file = Path(name)
+    functions = {called: definition(file.name, read_text(file), called) for called in _ARGUMENTS}
+    for called, arguments in _ARGUMENTS.items():
+        check_function(f"{called} of {file.name}", bind(functions[called], dt=0.0), arguments)
+    if not takes(functions["control"], "dt"):
+        raise UserError(f"control of {file.name} has no parameter dt; add it, the time between calls, s")
+    return SimpleNamespace(**functions)
 
 
 def setpoints(conditions: Conditions, t: jax.Array) -> Any:

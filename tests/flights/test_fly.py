@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones import State, load_params, optimal, repeat
 from jaxdrones.control import Setpoint
@@ -139,6 +140,12 @@ def test_progress_goes_from_nothing_to_all():
         ),
         (dict(flight="circle", feedforward=1), "feedforward is 1; give True or False"),
         (dict(flight="velocity", vehicle="hb"), "no PID gains for 'hb'"),
+        (
+            dict(flight="circle", controller="pdi"),
+            r"'pdi'; did you mean 'pid'\? \(known: pid, .*, mppi, or a \.py file\)",
+        ),
+        (dict(flight="circle", controller="mine.py:control"), "give the whole file, 'mine.py'"),
+        (dict(flight="circle", controller="missing.py"), "missing.py: cannot be read"),
     ],
 )
 def test_a_wrong_option_is_refused_with_what_to_do(options, message):
@@ -155,6 +162,46 @@ def test_optimal_controllers_fly_the_examples_closer_than_pid(flight, controller
     assert diverged(record) == {}
     for row, pid_row in zip(results(record), results(by_pid), strict=True):
         assert row["rms_error_m"] < 0.7 * pid_row["rms_error_m"]  # the take-off has only 0.5 s: measured 0.57
+
+
+def test_a_controller_in_a_file_is_called_as_one_of_the_package_is(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import jax.numpy as jnp\n"
+        "def gains(): return 3.0\n"
+        "def init(): return jnp.zeros(2)\n"
+        "def control(gains, params, memory, state, setpoint, dt):\n"
+        "    return memory + gains * dt, jnp.stack([state.pos[0], setpoint.pos[2], setpoint.vel[0], params.mass])\n"
+    )
+    conditions = Conditions("circle", controller=str(file))
+    assert conditions.feedforward
+    params, start = repeat(load_params("cf2x"), 4), State.at_rest(np.eye(4, 3))
+
+    def called(t):
+        controller = controller_of(conditions)
+        return setpoints(conditions, t), controller.control(params, controller.init(params, start), start, t)
+
+    told, (memory, rpm) = jit_unoptimized(called)(1.3)
+    np.testing.assert_allclose(memory, np.full((4, 2), 3.0 / 120), rtol=1e-12)
+    np.testing.assert_array_equal(rpm.T, [start.pos[:, 0], told.pos[:, 2], told.vel[:, 0], params.mass])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("def gains(): ...\ndef init(): ...\n", r"mine\.py defines no 'control' \(it defines gains, init\)"),
+        ("def control(*x, dt): ...\ndef init(): ...\ngains = 3\n", r"gains of mine\.py: 3 is not a function"),
+        ("def control(a, b, dt): ...\ndef init(): ...\ndef gains(): ...\n", r"give a function of \(gains, params, mem"),
+        (
+            "def control(g, p, m, s, x): ...\ndef init(): ...\ndef gains(): ...\n",
+            r"mine\.py has no parameter dt; add it",
+        ),
+    ],
+)
+def test_a_file_without_the_functions_of_a_controller_is_refused(text, message, tmp_path):
+    (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        controller_of(Conditions("circle", controller=str(tmp_path / "mine.py")))
 
 
 def test_every_controller_receives_the_same_motion_of_the_target():

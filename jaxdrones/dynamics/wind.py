@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function, number
-from jaxdrones.checks import check_function, check_number
+from jaxdrones.checks import check_function, check_number, check_shape
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -38,7 +38,7 @@ def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag
         effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`.
 
     Raises:
-        ValueError: an argument of another type; in flight, a field of time without a clock.
+        ValueError: an argument of another type; in flight, a field of time without a clock, or a wind of another shape.
     """
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_function("field", field, arguments, example="jaxdrones.logarithmic_wind(5.0)")
@@ -50,6 +50,7 @@ def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag
                 "the wind field depends on time and state.aux lacks 'clock'; give models=(jaxdrones.clock(),)"
             )
         wind = field(state.pos, state.aux["clock"]) if len(arguments) == 2 else field(state.pos)
+        check_shape("wind", wind, (3,), "m/s, world, as the field returns it")
         return effect(params.replace(wind=params.wind + wind), state, **scene)
 
     return blown

@@ -120,7 +120,7 @@ def make_step(
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
-        rpm (n, 4) the commanded rotor speeds. Rotor speeds are limited to [0, `params.max_rpm`]. There is no floor:
+        rpm (n, 4) the commanded rotor speeds, which the rotors limit to [0, `params.max_rpm`]. There is no floor:
         drones fall through z = 0 without `ground_contact` in `effects`, and pass through each other without
         `drone_contact` in `pairs`. The step raises `ValueError` on a wrong shape, and with concrete arguments on
         constants that cannot fly, on rotors that lag by less than half of `dt`, and on quaternions that are not of unit

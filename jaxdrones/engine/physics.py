@@ -178,7 +178,14 @@ class Physics:
                 raise UserError(
                     f"state.aux lacks {model.name!r}, the state of a model; start from step.init(params, state)"
                 )
-        return jax.vmap(self.rotors)(params, state, command)
+        speeds = jax.vmap(self.rotors)(params, state, command)
+        if jax.tree.map(np.shape, speeds) != (command.shape, command.shape):
+            returned = jax.tree.map(lambda x: np.shape(x)[1:], speeds)
+            raise UserError(
+                f"rotors: {describe([self.rotors])} returned arrays of shape {returned}; return a tuple of the speeds "
+                "(4,), RPM, and their rates (4,), RPM/s"
+            )
+        return speeds
 
     def at_speed(self, params: Params, state: State, command: Float[Array, "n 4"]) -> State:
         """State of a team with rotors without a lag at their commanded speed."""

@@ -25,7 +25,9 @@ _LEG = 1 / 30  # s: one leg a screen frame
 @checked
 def rollout(
     step: Advance,
-    control: Annotated[Control, function("lambda params, memory, state, k: (memory, rpm)")],
+    control: Annotated[
+        Control, function("lambda params, memory, state, k: (memory, rpm)", ("params", "memory", "state", "k"))
+    ],
     params: Params,
     state: Annotated[State, check_state],
     memory: Any,

@@ -64,7 +64,7 @@ def _first_readings(env: Any, key: jax.Array, world: World, rate: State | None) 
     if rate is None:
         return world
     init_key, measure_key = jax.random.split(jax.random.fold_in(key, SENSORS))
-    world = world.replace(sensors=init_sensors(env.sensors, init_key, world.params))
+    world = world.replace(sensors=init_sensors(env.sensors, init_key, world.params, world.drones))
     return _measured(env, measure_key, world, rate)
 
 

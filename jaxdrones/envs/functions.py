@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_params, is_concrete, short_repr
+from jaxdrones.checks import check_function, check_params, is_concrete, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.engine.team import check_state
 from jaxdrones.errors import UserError
@@ -44,6 +44,7 @@ def scene_example(scene: Scene | DrawScene) -> Scene:
         return scene
     if not callable(scene):
         raise UserError(f"scene is {short_repr(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
+    check_function("scene", scene, ("key",))
     example = jax.eval_shape(scene, jax.random.key(0))
     if not isinstance(example, Scene):
         returned = short_repr(scene(jax.random.key(0)))

@@ -24,7 +24,7 @@ _DRAWS = 1000
 DELAY = "delay"
 """Key of `Params.aux`: random delay of an episode, control steps."""
 
-Field = Annotated[str, choice("parameter", Params.__dataclass_fields__)]
+Field = Annotated[str, choice("parameter", [name for name in Params.__dataclass_fields__ if name != "aux"])]
 Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> measured state."""
 

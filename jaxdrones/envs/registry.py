@@ -68,11 +68,13 @@ def make(
     pairs: Annotated[Sequence[str | Callable] | None, sequence("'downwash'")] = None,
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
-    rotors: str | None = None,
-    integrator: str = "semi_implicit_euler",
+    rotors: str | Callable | None = None,
+    integrator: str | Callable = "semi_implicit_euler",
     control_hz: Hertz | None = None,
     substeps: Count | None = None,
-    randomize: Annotated[Sequence[Randomization] | None, sequence(_SCALED, function(_SCALED))] = None,
+    randomize: Annotated[
+        Sequence[Randomization] | None, sequence(_SCALED, function(_SCALED, ("key", "params")))
+    ] = None,
     noise: Annotated[Noise | None, function("sensor_noise()", ("key", "state"))] = None,
     disturbance: Annotated[Disturbance | None, function("random_pushes(0.3)", ("key", "params", "dt"))] = None,
     delay: float | tuple[float, float] | None = None,
@@ -97,8 +99,8 @@ def make(
         pairs: names of `PAIRS` or functions; by default the task's.
         team_effects: functions `(params, state) -> Wrench` of the whole team.
         models: additional differential equations, such as a battery.
-        rotors: `instant` or `lagging`.
-        integrator: a name of `INTEGRATORS`; Bullet has its own.
+        rotors: `instant`, `lagging`, or a function as for `make_step`.
+        integrator: a name of `INTEGRATORS`, or a function; Bullet has its own.
         control_hz: control steps per second; by default the task's.
         substeps: physics steps per control step; by default the task's.
         randomize: randomizations of each episode's parameters.
@@ -245,7 +247,7 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
 def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
     """Action type for the vehicle; raise if its controller is unstable with it."""
     kind = _named("action", action, ACTIONS)
-    kind = kind() if callable(kind) else kind
+    kind = kind() if isinstance(action, str | type) else kind
     if not isinstance(kind, Action):
         raise UserError(
             f"action is {short_repr(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_function, check_number, check_sequence, short_repr
+from jaxdrones.checks import bind, check_function, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
@@ -48,7 +48,8 @@ class Sensor:
     sensor documents its units and frames.
     """
     init: Callable[..., Any] = no_memory
-    """`init(key, params) -> memory`: memory of one drone at the start of an episode, a pytree of arrays."""
+    """`init(key, params) -> memory`: memory of one drone at the start of an episode, a pytree of arrays. A parameter
+    named `state` receives the initial state of the drone."""
     bound: float = np.inf
     """Largest absolute value of a reading, in its units."""
     rate: float | None = None
@@ -63,7 +64,9 @@ class Sensor:
         if not isinstance(self.name, str) or not self.name:
             raise UserError(f"name of a sensor is {short_repr(self.name)}; give a text, for example 'imu'")
         for field, arguments in _ARGUMENTS.items():
-            check_function(f"{field} of sensor {self.name!r}", getattr(self, field), arguments)
+            function = getattr(self, field)
+            function = bind(function, state=None) if field == "init" else function
+            check_function(f"{field} of sensor {self.name!r}", function, arguments)
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
             check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)
@@ -105,11 +108,18 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
     return sensors
 
 
-def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params) -> dict[str, Any]:
+def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params, state: State) -> dict[str, Any]:
     """Memories by name of the sensors of a team of n drones at the start of an episode, each with n rows."""
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))
-    return {sensor.name: jax.vmap(sensor.init)(keys[i], params) for i, sensor in enumerate(sensors)}
+    memories = {}
+    for i, sensor in enumerate(sensors):
+
+        def init(key, params, state, sensor=sensor):
+            return bind(sensor.init, state=state)(key, params)
+
+        memories[sensor.name] = jax.vmap(init)(keys[i], params, state)
+    return memories
 
 
 def measure_sensors(

@@ -126,6 +126,9 @@ def test_mistakes_are_named():
         jd.in_wind(lambda pos, time, more: pos, jd.drag)
     with pytest.raises(ValueError, match=r"state.aux lacks 'clock'; give models=\(jaxdrones.clock\(\),\)"):
         jd.in_wind(lambda pos, time: pos, jd.drag)(CF2X, HOVER)
+    for wind in 3.0, jnp.zeros(2):
+        with pytest.raises(ValueError, match=r"wind has shape \(2?,?\); expected \(3,\): m/s, world"):
+            jd.in_wind(lambda pos, wind=wind: wind, jd.drag)(CF2X, HOVER)
     with pytest.raises(ValueError, match=r"params.aux lacks 'drag_area'; found nothing"):
         jd.quadratic_drag(CF2X.replace(aux={}), HOVER)
 

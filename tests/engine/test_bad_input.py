@@ -129,6 +129,24 @@ def test_an_effect_that_returns_no_wrench_is_named(effects, pairs, message):
 
 
 @pytest.mark.parametrize(
+    ("returned", "shape"),
+    [
+        (lambda rpm: rpm, r"\(4,\)"),
+        (lambda rpm: (rpm[0], rpm), r"\(\(\), \(4,\)\)"),
+        (lambda rpm: (rpm,), r"\(\(4,\),\)"),
+    ],
+)
+def test_rotors_that_return_no_speeds_and_rates_are_named(returned, shape):
+    def mine(params, state, command):
+        return returned(command)
+
+    with pytest.raises(
+        ValueError, match=rf"rotors: mine returned arrays of shape {shape}; return a tuple of the speeds"
+    ):
+        jaxdrones.make_step(rotors=mine)(team, start, rpm)
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (

@@ -149,6 +149,10 @@ def test_a_checkpoint_divides_the_flight(every):
             lambda *_: ({"a": 1}, commands[0]),
             r"control was given the memory .* and returned .*'a'.* of the same structure",
         ),
+        (
+            lambda params, memory, state: None,
+            r"control: <lambda> takes .*; give a function of \(params, memory, state, k\)",
+        ),
         ("replay", r"control: 'replay' is not a function; give for example lambda params, memory, state, k"),
     ],
 )

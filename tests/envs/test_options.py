@@ -108,6 +108,9 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(vision="rgb"), r"vision is 'rgb'; give a sequence, for example \('depth',\)"),
         (dict(randomize=scaled("mass", 0.9, 1.1)), r"randomize is .*; give a sequence"),
         (dict(randomize=("mass",)), r"randomize: 'mass' is not a function"),
+        (dict(randomize=(lambda params: params,)), r"randomize: <lambda> takes .*; give a function of \(key, params\)"),
+        (dict(scene=lambda: 3), r"scene: <lambda> takes \(\); give a function of \(key\)"),
+        (dict(action=lambda obs: obs), r"action is <function .*; give an object of Action"),
         (dict(noise=0.1), r"noise: 0.1 is not a function; give for example sensor_noise\(\)"),
         (dict(disturbance=0.1), r"disturbance: 0.1 is not a function; give for example random_pushes\(0.3\)"),
         (dict(observation=(3,)), r"observation: 3 is not an observation term"),
@@ -122,7 +125,7 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(vehicle=CF2X.replace(inertia=[1e-5, 1e-5, 2e-5])), r"params\.inertia is \[1e-05.*; give an array"),
         (dict(vehicle=CF2X.replace(kf=jnp.nan)), r"params\.kf is not finite"),
     ],
-    ids=range(19),
+    ids=range(22),
 )
 def test_a_mistake_in_an_option_is_named(options, message):
     with pytest.raises(ValueError, match=message):

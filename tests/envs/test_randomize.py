@@ -179,6 +179,9 @@ def test_mistakes_are_named():
         scaled("mas", 0.9, 1.1)
     with pytest.raises(ValueError, match=r"the range of mass is \(1.1, 0.9\); give the lower bound first"):
         scaled("mass", 1.1, 0.9)
+    for randomization in scaled, shifted:
+        with pytest.raises(ValueError, match=r"unknown parameter 'aux' \(known: air_density, collision_"):
+            randomization("aux", 0.9, 1.1)
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def measured(sensor, params, state, rate=None, scene=None):
     """The first reading."""
     rate = jax.tree.map(jnp.zeros_like, state) if rate is None else rate
     scene = Scene() if scene is None else scene
-    memories = init_sensors((sensor,), KEY, params)
+    memories = init_sensors((sensor,), KEY, params, state)
     return measure_sensors((sensor,), KEY, params, state, rate, scene, memories)[1][sensor.name]
 
 
@@ -118,7 +118,7 @@ def test_the_variance_of_a_bias_grows_linearly_and_that_of_white_noise_does_not(
             memories, readings = measure_sensors(sensors, key, params, state, rate, Scene(), memories)
             return memories, (memories["imu"], readings["imu"])
 
-        return jax.lax.scan(measure, init_sensors(sensors, key, params), jax.random.split(key, 40))[1]
+        return jax.lax.scan(measure, init_sensors(sensors, key, params, state), jax.random.split(key, 40))[1]
 
     bias, reading = run(KEY)
     steps, spread = np.arange(1, 41), 4 * np.sqrt(2 / (3 * n))  # 4 standard deviations of a variance

@@ -51,7 +51,7 @@ def odometer() -> jd.Sensor:
 
 
 def measure(sensors, key=KEY, memories=None):
-    memories = init_sensors(sensors, key, PARAMS) if memories is None else memories
+    memories = init_sensors(sensors, key, PARAMS, STATE) if memories is None else memories
     rate = jax.tree.map(jnp.zeros_like, STATE)
     return measure_sensors(sensors, key, PARAMS, STATE, rate, Scene(), memories)
 
@@ -82,12 +82,21 @@ def test_memories_are_carried_through_a_scan():
 
     @jit_unoptimized
     def run(key):
-        start = init_sensors(sensors, key, PARAMS)
+        start = init_sensors(sensors, key, PARAMS, STATE)
         return jax.lax.scan(lambda memories, key: measure(sensors, key, memories), start, jax.random.split(key, 5))
 
     memories, readings = run(KEY)
     assert memories["odometer"]["count"].tolist() == [5, 5]
     assert readings["altimeter"].shape == (5, 2)
+
+
+def test_a_memory_may_begin_with_the_state_of_its_drone():
+    def lagging(key, params, state, rate, scene, memory):
+        memory = memory + 0.1 * (state.pos[2] - memory)
+        return memory, memory
+
+    _, readings = measure((jd.Sensor("lagging", lagging, lambda key, params, state: state.pos[2]),))
+    np.testing.assert_array_equal(readings["lagging"], STATE.pos[:, 2])
 
 
 def returning(result):

@@ -37,6 +37,12 @@ many = jax.tree.map(lambda x: jnp.stack([x, x]), start)
 last: jd.State = jd.over_worlds(fly)(many)
 slope: jd.State = jax.grad(miss)(start)
 
+
+def slow_rotors(params: jd.Params, state: jd.State, command: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return state.rpm, (command - state.rpm) / 0.1
+
+
+custom = jd.make("hover", rotors=slow_rotors, integrator=jd.rk4)
 env = jd.make("hover", action="rpm", drones=1, duration=0.1)
 obs, world = env.reset(jax.random.key(0))
 obs, world, reward, terminated, truncated, info = env.step(jax.random.key(1), world, jnp.zeros((1, env.action_size)))

@@ -66,9 +66,11 @@ class Scene(PyTreeNode, kw_only=True):
             ValueError: an argument that is not an obstacle, or one of a wrong shape or size.
         """
         for obstacle in obstacles:
-            if not isinstance(obstacle, Obstacle | File):
+            if not isinstance(obstacle, (*KINDS.values(), File)):
                 known = ", ".join(kind.__name__ for kind in (*KINDS.values(), Mesh, Urdf))
-                raise UserError(f"{short_repr(obstacle)} is not an obstacle; give each as its own argument: {known}")
+                raise UserError(
+                    f"{short_repr(obstacle)} is not an obstacle of a known kind; give each as its own argument: {known}"
+                )
         arrays: dict[str, Any] = {}
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]

@@ -17,6 +17,7 @@ from jaxdrones.sensing import (
     gate,
     obstacles_2021,
 )
+from jaxdrones.sensing.shapes import Obstacle
 
 QUARTER_TURN = (0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4))  # about z
 BALL = Sphere(pos=(1, 1, 1), radius=0.5)
@@ -133,6 +134,10 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
         (lambda: Scene.of(BALL, BALL).padded(spheres=1), "has 2 spheres and the array holds 1; give spheres=2 or more"),
         (lambda: Scene.of(BALL).padded(balls=1), "unknown kind of obstacles 'balls'"),
         (lambda: Scene.of("box"), "'box' is not an obstacle"),
+        (
+            lambda: Scene.of(Obstacle(pos=(0, 0, 0))),
+            "Obstacle.* is not an obstacle of a known kind; give .*: Box, Sphere",
+        ),
         (lambda: Scene.of((BALL, BALL)), "give each as its own argument"),
         (lambda: Scene.of(BALL, ground=3), "ground is 3; give True or False"),
         (lambda: gate((0, 0, 1), opening=-1), "opening of a gate is -1; give a positive number"),

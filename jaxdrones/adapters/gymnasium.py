@@ -16,13 +16,12 @@ from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
 from jaxdrones.adapters import pictures
-from jaxdrones.adapters.session import SEEDS, Session, as_env, as_numpy, flat, rewarding
+from jaxdrones.adapters.session import SEEDS, Session, TaskOrEnv, as_env, as_numpy, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.arguments import Count, Switch, checked
 from jaxdrones.checks import check_whole, look_up, short_repr
 from jaxdrones.errors import UserError
-from jaxdrones.tasks.task import Task
 
 NAMESPACE = "jaxdrones"
 
@@ -39,7 +38,7 @@ class GymnasiumEnv(gymnasium.Env):
     @checked
     def __init__(
         self,
-        task: str | Task | envs.Env,
+        task: TaskOrEnv,
         *,
         dict_spaces: Switch = False,
         team_reward: str = "sum",
@@ -49,7 +48,7 @@ class GymnasiumEnv(gymnasium.Env):
         """Wrap an environment.
 
         Args:
-            task: a name, a task, or an environment.
+            task: as for `jaxdrones.make`, or an environment.
             dict_spaces: whether observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones
                 (2021); else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
             team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
@@ -107,7 +106,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     @checked
     def __init__(
         self,
-        task: str | Task | envs.Env,
+        task: TaskOrEnv,
         num_envs: Count = 1,
         *,
         dict_spaces: Switch = False,
@@ -121,7 +120,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Wrap an environment.
 
         Args:
-            task: a name, a task, or an environment.
+            task: as for `jaxdrones.make`, or an environment.
             num_envs: number of worlds.
             dict_spaces: as for `GymnasiumEnv`.
             team_reward: as for `GymnasiumEnv`.

@@ -8,11 +8,9 @@ import gymnasium
 import numpy as np
 
 from jaxdrones.adapters import pictures
-from jaxdrones.adapters.session import TeamEpisodes, flat
+from jaxdrones.adapters.session import TaskOrEnv, TeamEpisodes, flat
 from jaxdrones.arguments import checked
-from jaxdrones.envs import Env
 from jaxdrones.errors import UserError, install
-from jaxdrones.tasks.task import Task
 
 try:
     import pettingzoo
@@ -20,7 +18,7 @@ except ImportError as error:
     raise ImportError(f"pettingzoo is not installed; {install('pettingzoo')}") from error
 
 
-def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
+def parallel_env(task: TaskOrEnv, **options: Any) -> ParallelEnv:
     """Make a team with agents `drone_0`, `drone_1`, ..., with the options of `jaxdrones.make`."""
     return ParallelEnv(task, **options)
 
@@ -29,7 +27,7 @@ class ParallelEnv(TeamEpisodes, pettingzoo.ParallelEnv):
     """One world; see `TeamEpisodes`."""
 
     @checked
-    def __init__(self, task: str | Task | Env, *, render_mode: pictures.RenderMode = None, **options: Any):
+    def __init__(self, task: TaskOrEnv, *, render_mode: pictures.RenderMode = None, **options: Any):
         """Wrap an environment; arguments are those of `GymnasiumEnv`."""
         self._wrap(task, options)
         self.render_mode = render_mode

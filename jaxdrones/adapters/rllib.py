@@ -4,9 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.adapters.session import TeamEpisodes
-from jaxdrones.envs import Env
-from jaxdrones.tasks.task import Task
+from jaxdrones.adapters.session import TaskOrEnv, TeamEpisodes
 
 try:
     from ray.rllib.env import multi_agent_env
@@ -17,8 +15,8 @@ except ImportError as error:
 class MultiAgentEnv(TeamEpisodes, multi_agent_env.MultiAgentEnv):
     """One world; see `TeamEpisodes`."""
 
-    def __init__(self, task: str | Task | Env, **options: Any):
-        """Wrap an environment: a name, a task or an environment, and options of `jaxdrones.make`."""
+    def __init__(self, task: TaskOrEnv, **options: Any):
+        """Wrap an environment: a task as for `jaxdrones.make` with its options, or an environment."""
         super().__init__()
         self._wrap(task, options)
         self.agents = list(self.possible_agents)

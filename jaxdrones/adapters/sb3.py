@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.adapters import gymnasium
-from jaxdrones.envs import Env
+from jaxdrones.adapters.session import TaskOrEnv
 from jaxdrones.errors import UserError, install
-from jaxdrones.tasks.task import Task
 
 try:
     from stable_baselines3.common import vec_env
@@ -25,7 +24,7 @@ class VecEnv(vec_env.VecEnv):
 
     def __init__(
         self,
-        task: str | Task | Env,
+        task: TaskOrEnv,
         num_envs: int,
         *,
         seed: int | None = None,
@@ -35,7 +34,7 @@ class VecEnv(vec_env.VecEnv):
         """Create the worlds.
 
         Args:
-            task: a name, a task, or an environment.
+            task: as for `jaxdrones.make`, or an environment.
             num_envs: number of worlds.
             seed: seed of the first reset; SB3's algorithms set it too.
             render_mode: `rgb_array` or `None`.

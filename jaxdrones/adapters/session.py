@@ -15,6 +15,8 @@ from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task, World
 
+TaskOrEnv = str | Task | Callable[..., Task] | Env
+"""Task as for `jaxdrones.make`, or an environment."""
 SEEDS = 2**32  # modulus of seeds
 _GROUPS = {"rewards": "reward", "metrics": "metric", "terminations": "termination", "truncations": "truncation"}
 
@@ -59,7 +61,7 @@ class TeamEpisodes:
     An agent leaves `agents` when its episode has ended, by default with all others. See `Task.ends`.
     """
 
-    def _wrap(self, task: str | Task | Env, options: dict[str, Any]) -> None:
+    def _wrap(self, task: TaskOrEnv, options: dict[str, Any]) -> None:
         self.env = as_env(task, options)
         self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]
         self.agents: list[str] = []
@@ -98,8 +100,8 @@ class TeamEpisodes:
         self._session.close()
 
 
-def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
-    """Environment from a name, a task, or an environment."""
+def as_env(task: TaskOrEnv, options: dict[str, Any]) -> Env:
+    """Environment of a task with options of `jaxdrones.make`, or the given one."""
     if not isinstance(task, Env):
         return make(task, **options)
     if options:

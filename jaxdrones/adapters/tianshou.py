@@ -8,13 +8,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from jaxdrones.adapters import pictures
-from jaxdrones.adapters.session import SEEDS, as_env
+from jaxdrones.adapters.session import SEEDS, TaskOrEnv, as_env
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.arguments import Count, checked
-from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
-from jaxdrones.tasks.task import Task
 
 try:
     from tianshou.env import BaseVectorEnv
@@ -31,7 +29,7 @@ class VectorEnv(BaseVectorEnv):
     @checked
     def __init__(
         self,
-        task: str | Task | Env,
+        task: TaskOrEnv,
         num_envs: Count,
         *,
         seed: int | None = None,

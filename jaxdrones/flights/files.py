@@ -115,15 +115,17 @@ def arrays_of(log: FlightLog, pwm: bool = False) -> dict[str, np.ndarray]:
     return arrays | {"pwm": rpm_to_pwm(log.rpm)} if pwm else arrays
 
 
-def save_npz(log: FlightLog, path: Path, pwm: bool = False) -> None:
-    """Write a log as named arrays."""
+def save_npz(log: FlightLog, path: str | os.PathLike, pwm: bool = False) -> None:
+    """Write a log as named arrays; missing folders are created."""
     arrays: dict[str, Any] = arrays_of(log, pwm)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as new:
         np.savez_compressed(new, **arrays)
 
 
-def save_csv(log: FlightLog, path: Path, pwm: bool = False) -> None:
-    """Write a log with one line per time and drone."""
+def save_csv(log: FlightLog, path: str | os.PathLike, pwm: bool = False) -> None:
+    """Write a log with one line per time and drone; missing folders are created."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     arrays = {name: x for name, x in arrays_of(log, pwm).items() if name in (*_WIDTHS, "rpy")}
     names = [f"{name}_{axis}".rstrip("_") for name in arrays for axis in _AXES.get(name, "xyz")]
     rows = np.concatenate([x.reshape(len(log.t), len(log.labels), -1) for x in arrays.values()], axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.dynamics.model import PointMass
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
@@ -106,7 +107,14 @@ class FlightLog:
     """File of the log."""
 
     def __post_init__(self):
-        rows, drones = np.shape(self.pos)[:2]
+        rows, drones = len(self.t), (*np.shape(self.pos), 0, 0)[1]
+        for name, width in STATE.items():
+            shape = np.shape(getattr(self, name))
+            if shape != (rows, drones, width):
+                raise UserError(
+                    f"{name} of a log has shape {shape}, pos {np.shape(self.pos)} and t {np.shape(self.t)}; give "
+                    f"(K, n, {width}) of K times and n drones, also of one drone"
+                )
         for name, width in OPTIONAL.items():
             shape = (rows, drones, width) if width else (rows, drones)
             known = np.isfinite(getattr(self, name)).any()

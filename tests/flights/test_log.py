@@ -10,7 +10,7 @@ import pytest
 
 from jaxdrones.cli import main
 from jaxdrones.firmware.drone import Recorder, Sample
-from jaxdrones.flights import load_flights, read_log, save_csv
+from jaxdrones.flights import FlightLog, load_flights, read_log, save_csv, save_npz
 from jaxdrones.flights.log import OPTIONAL, STATE
 from jaxdrones.urdf import load_params
 
@@ -94,6 +94,15 @@ def test_headers_that_claim_too_much_and_plain_arrays_are_refused(columns, tmp_p
         (tmp_path / "cut.npz").write_bytes(whole[:cut])
         with pytest.raises(ValueError, match=r"is not an \.npz file"):
             read_log(tmp_path / "cut.npz")
+
+
+def test_a_log_is_made_of_arrays_with_a_drone_axis_and_saved_to_a_new_folder(columns, tmp_path):
+    arrays = {name: np.asarray(columns[name])[:, None] for name in STATE}
+    save_npz(FlightLog(columns["t"], **arrays), f"{tmp_path}/new/log.npz")
+    np.testing.assert_array_equal(read_log(tmp_path / "new").pos, arrays["pos"])
+    for name, wrong in ("pos", columns["pos"]), ("quat", columns["quat"]), ("vel", arrays["vel"][1:]):
+        with pytest.raises(ValueError, match=rf"{name} of a log has shape \(.*; give \(K, n, \d\) of K times and n"):
+            FlightLog(columns["t"], **(arrays | {name: wrong}))
 
 
 def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tmp_path):

@@ -179,6 +179,11 @@ class _ManyWorlds:
 def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     """Number of worlds, equal for all arguments."""
     for axis in axes:
+        if axis is None:
+            raise UserError(
+                "an axis of in_axes is None; close over an argument that all worlds share, for example "
+                "over_worlds(lambda start: fly(params, start))"
+            )
         check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):
         raise UserError(f"in_axes is of {len(axes)} arguments, {len(arguments)} were given; give an axis for each")

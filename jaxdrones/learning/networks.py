@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function
-from jaxdrones.checks import is_concrete
+from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -61,12 +61,16 @@ class OwnNetwork:
 
     @checked
     def __init__(self, module: Annotated[Any, function("a flax or equinox module", name="network")], output_size: int):
+        if isinstance(module, type):
+            raise UserError(f"network is the class {module.__name__}; give an object of this class")
         self.module, self.output_size = module, output_size
         self.recurrent = hasattr(module, "initial_hidden_state")
         if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_concrete(x)):
             raise UserError("network.initial_hidden_state() is not zero; give zeros")
         if not isinstance(module, nn.Module):
             self._leaves, self._structure = jax.tree.flatten(module)
+            if not any(map(_is_trained, self._leaves)):
+                raise UserError(f"network {short_repr(module)} has no parameters; give a flax or equinox module")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, OwnNetwork) and self.module is other.module
@@ -176,7 +180,7 @@ class Policy(PyTreeNode):
         network replaces these sizes, see `OwnNetwork`.
 
         Raises:
-            ValueError: a network with the wrong input or output for the environment.
+            ValueError: a network without parameters, or with the wrong output for the environment.
         """
         obs = example_observation(env)
         own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size, env.sets, set_sizes)

@@ -110,7 +110,13 @@ class Started(Remember):
 
 @pytest.mark.parametrize(
     "network, error",
-    [(3, "3 is not a function"), (MLP((4,), 2), r"outputs \(2,\) .* give \(1,\)"), (Started(), "is not zero")],
+    [
+        (3, "3 is not a function"),
+        (MLP((4,), 2), r"outputs \(2,\) .* give \(1,\)"),
+        (Started(), "is not zero"),
+        (Started, "network is the class Started; give an object"),
+        (lambda obs: obs[:1], "network <function .* has no parameters; give a flax or equinox module"),
+    ],
 )
 def test_a_network_that_does_not_fit_is_refused(network, error):
     with pytest.raises(ValueError, match=error):

@@ -133,6 +133,7 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
         critic_hidden_sizes=(64, 64),
         privileged_critic=True,
         critic_learning_rate=3e-3,  # at the rate of the policy or 1e-3, fewer episodes succeed
+        gae_lambda=0.97,
         target_kl=0.01,
         init_std=0.6,
         min_std=0.2,
@@ -164,8 +165,18 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
 }
 """Options of the environment in training, where they differ from those in flight."""
 _REALISTIC_PRACTICE_OPTIONS: dict[tuple[str, bool | str], dict[str, Any]] = {
-    # Up to 40 ms in flight, where policies trained with up to 40 ms oscillate.
-    ("hover", True): dict(delay=(0.0, 0.05)),
+    # Beyond the limits of flight: with the same limits in training, vehicles close to them oscillate.
+    ("hover", True): dict(
+        delay=(0.0, 0.05),
+        randomize=realistic_randomization(
+            mass=(0.87, 1.1),
+            inertia=(0.75, 1.25),
+            kf=(0.9, 1.13),
+            km=(0.2, 1.35),
+            rotor_rise_time=(0.75, 1.25),
+            rotor_fall_time=(0.1, 1.35),
+        ),
+    ),
     # Few of the drawn vehicles are among the lightest, and some vehicles have faster rotors than any drawn one.
     ("hover", "any"): dict(
         delay=(0.0, 0.05),
@@ -174,14 +185,8 @@ _REALISTIC_PRACTICE_OPTIONS: dict[tuple[str, bool | str], dict[str, Any]] = {
 }
 _REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
     # Without the additional reward drones settle a few centimeters away, or too late; with the starts of flight alone
-    # those from a large tilt do; with the parameters of flight alone the vehicles that react most strongly oscillate.
-    "hover": dict(
-        precision=1.0,
-        speed=1.5,
-        omega=2.0,
-        tilt=110.0,
-        randomize=realistic_randomization(mass=(0.87, 1.1), kf=(0.9, 1.13), rotor_fall_time=(0.1, 1.2)),
-    ),
+    # those from a large tilt do.
+    "hover": dict(precision=1.0, speed=1.5, omega=2.0, tilt=110.0),
 }
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
 
@@ -206,7 +211,7 @@ def preset(
         realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters; the policy also
             observes rotor speeds and its last five actions. With `any`, every episode has a random vehicle, and the
             policy observes its last action and commands `throttle`, independent of the parameters of the vehicle.
-        practice: whether to make the environment for training, which may have easier or harder starts or longer delays
+        practice: whether to make the environment for training, which may have easier or harder starts and conditions
             than that for flight.
         **options: options of `jaxdrones.make`.
     """

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import writing
-from jaxdrones.envs import make
+from jaxdrones.envs import make, randomize
 from jaxdrones.learning.networks import Policy
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Progress, Run
@@ -113,11 +113,19 @@ def test_a_recipe_survives_json(realistic):
 
 
 @pytest.mark.slow
-def test_realistic_hover_trains_with_longer_delays_than_in_flight_unless_a_delay_is_given():
-    recipe, given = Recipe.of("hover", realistic=True), Recipe.of("hover", realistic=True, delay=0.01)
+def test_realistic_hover_trains_beyond_the_limits_of_flight_unless_they_are_given():
+    recipe, given = Recipe.of("hover", realistic=True), Recipe.of("hover", realistic=True, delay=0.01, randomize=())
     assert recipe.env().delay == (0.0, 0.04) and recipe.env(practice=True).delay == (0.0, 0.05)
     assert given.env(practice=True).delay == given.env().delay == (0.01, 0.01)
-    assert Recipe.of("hover", realistic="any").env(practice=True).delay == (0.0, 0.04)
+    assert Recipe.of("hover", realistic="any").env(practice=True).delay == (0.0, 0.05)
+    keys = jax.random.split(jax.random.key(0), 1000)
+    drawn, practiced = (
+        jax.vmap(lambda key, env=env: randomize.draw(env.randomize, key, env.params))(keys)
+        for env in (recipe.env(), recipe.env(practice=True))
+    )
+    for name in ("mass", "inertia", "kf", "km", "rotor_rise_time", "rotor_fall_time"):
+        assert np.ptp(getattr(practiced, name)) > 1.1 * np.ptp(getattr(drawn, name)), name
+    assert given.env(practice=True).randomize == given.env().randomize == ()
 
 
 @pytest.mark.slow

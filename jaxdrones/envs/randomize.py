@@ -58,8 +58,11 @@ def shifted(field: Field, low: float, high: float) -> Randomization:
 
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
-        if field in POSITIVE and is_concrete(value) and (lowest := float(np.asarray(value).min())) + low <= 0:
-            raise UserError(f"the lower bound of {field}, which is {lowest:g}, is {low:g}; give more than {-lowest:g}")
+        if field in (*POSITIVE, *NOT_NEGATIVE) and is_concrete(value):
+            lowest, positive = float(np.asarray(value).min()), field in POSITIVE
+            if lowest + low < 0 or (positive and lowest + low == 0):
+                least = f"{'more than' if positive else 'at least'} {0 - lowest:g}"
+                raise UserError(f"the lower bound of {field}, which is {lowest:g}, is {low:g}; give {least}")
         return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
 
     return described(f"{field} plus U({low:g}, {high:g}), each entry", randomize)

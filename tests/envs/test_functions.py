@@ -133,6 +133,7 @@ def test_a_number_of_steps_that_makes_no_sense_is_refused(steps):
             shifted("inertia", -2e-5, 1e-5),
             "the lower bound of inertia, which is 1.4e-05, is -2e-05; give more than -1.4e-05",
         ),
+        (shifted("km", -1e-11, 0.0), "of km, which is 7.94e-12, is -1e-11; give at least -7.94e-12"),
     ],
 )
 def test_randomizations_given_to_make_are_checked_like_those_of_a_task(randomization, said):

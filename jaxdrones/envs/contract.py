@@ -34,7 +34,7 @@ def check_env(env: Env, steps: int = 5) -> None:
     actions = jax.random.uniform(jax.random.key(2), (steps, env.drones, env.action_size), float, -0.3, 0.3)
     flown = []
     for k in range(steps):
-        before = jax.tree.map(np.array, world)
+        before = jax.tree.map(lambda x: np.array(_plain(x)), world)
         answer = env.step(keys[k], world, actions[k])
         _check_equal(world, before, f"the world given to step {k}, before and after")
         _check_answer(env, answer, f"at step {k}")

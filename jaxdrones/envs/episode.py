@@ -130,8 +130,8 @@ def outcome(
     if rate is not None:
         world = _measured(env, jax.random.fold_in(key, SENSORS), world, rate)
     world = world.replace(variables=task.advance(task, world))
-    active = world.active
-    rewards = {name: scale * term(task, world) for name, (scale, term) in task.rewards.items()}
+    active, dtype = world.active, world.drones.pos.dtype
+    rewards = {name: scale * jnp.asarray(term(task, world), dtype) for name, (scale, term) in task.rewards.items()}
     if task.ends == "drone":
         rewards = {name: jnp.where(active, term, 0) for name, term in rewards.items()}
     terminations, truncations = (

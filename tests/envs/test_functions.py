@@ -146,6 +146,27 @@ def test_functions_of_a_task_that_are_first_seen_in_a_program_are_traced_with_it
     assert jax.jit(lambda key: env.reset(key)[0])(jax.random.key(0)).shape == (N, 1)
 
 
+def test_a_reward_of_whole_numbers_is_one_of_real_numbers():
+    """Learners take the types of their weights from it, which would be rounded to zero."""
+    env = jd.make(dataclasses.replace(TASK, rewards={"low": (1, low), "fast": (2, lambda task, world: jnp.arange(N))}))
+
+    def step(key):
+        _, world = env.reset(key)
+        return env.step(key, world, jnp.zeros((N, 4)))
+
+    _, _, reward, _, _, info = jax.eval_shape(step, jax.random.key(0))
+    assert {x.dtype for x in (reward, *info["rewards"].values())} == {jnp.zeros(()).dtype}
+
+
+@pytest.mark.slow
+def test_a_task_may_keep_a_random_key_in_its_variables():
+    def drawn(key, params):
+        return start(key, params)[0], key
+
+    task = dataclasses.replace(TASK, start=drawn, advance=lambda task, world: jax.random.fold_in(world.variables, 1))
+    jd.envs.check_env(jd.make(task), steps=1)
+
+
 def test_a_duration_and_a_rate_may_be_arrays():
     env = jd.make(dataclasses.replace(TASK, duration=jnp.array(1.5)), control_hz=jnp.array(50.0))
     assert type(env.steps) is int and env.steps == 75 and type(env.dt) is float

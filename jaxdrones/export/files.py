@@ -90,6 +90,11 @@ def save(
     images = tuple(Tensor(x, space.shape, np.dtype(space.dtype).name) for x, space in sorted(env.image_spaces.items()))
     policies = [policy]
     if policy.per_agent:
+        if (networks := len(jax.tree.leaves(policy.params)[0])) != env.drones:
+            raise UserError(
+                f"the policy has a network for each of {networks} drones, and {env.task.name} has {env.drones}; give "
+                "the environment of the policy"
+            )
         policies = [
             policy.replace(params=jax.tree.map(lambda x: x[i], policy.params), per_agent=False)  # noqa: B023
             for i in range(env.drones)

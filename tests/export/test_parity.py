@@ -87,6 +87,13 @@ def test_drones_with_their_own_networks_have_a_file_each(to, tmp_path):
         assert difference(actions, np.asarray(both[..., 1 - i, :])) > DIFFERENT
 
 
+def test_networks_of_other_drones_than_those_of_the_environment_are_refused(tmp_path):
+    policy = exported.random_policy(made("team")[0], per_agent=True)
+    with pytest.raises(ValueError, match="a network for each of 2 drones, and leader-follower has 3"):
+        save(policy, jd.make("leader-follower", drones=3), "c", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 @functools.cache
 def flown() -> dict[str, np.ndarray]:
     """Observations (steps, drones, d) of flights by the policy."""

@@ -24,7 +24,7 @@ from jaxdrones.sensing.scene import AnalyticScene, Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.state import State
-from jaxdrones.vector import components
+from jaxdrones.vector import components, total
 
 _MULTI_RANGER = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)])
 _DOWN = np.array([(0, 0, -1)])
@@ -49,7 +49,7 @@ def ray(
         direction: (3,) unit vector, world. For another length, the distance is in multiples of that length.
 
     Returns:
-        () m; infinity, with a zero gradient, for a miss.
+        () m; infinity, with a zero gradient, for a miss; NaN for an origin or a direction that is not finite.
 
     Raises:
         ValueError: a wrong shape, or a mesh or URDF file in the scene.
@@ -60,7 +60,7 @@ def ray(
         hits.append(_to_ground(origin, direction))
     for shapes in scene.shapes(origin.dtype):
         hits.append(jnp.min(jax.vmap(_to_shape, (0, None, None))(shapes, origin, direction)))
-    return jnp.min(jnp.stack(hits))
+    return jnp.min(jnp.stack(hits)) + 0 * total(origin + direction)  # comparisons with NaN are false, as for a miss
 
 
 def _to_shape(shape: Obstacle, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:

@@ -194,6 +194,15 @@ def test_a_ray_that_starts_inside_ends_at_once_and_one_that_looks_away_never():
         assert ray(Scene.of(solid, ground=False), (5, 0, 2), (1, 0, 0)) == jnp.inf
 
 
+@pytest.mark.parametrize("ground", [True, False])
+def test_a_ray_from_a_place_that_is_not_a_number_is_no_miss(ground):
+    """Nor is it a hit: the distance is NaN, as are all other measurements of a drone that is nowhere."""
+    scene = Scene.of(Sphere(pos=(0, 0, 2), radius=0.3), ground=ground)
+    places = jnp.full((3, 3), 1.0).at[jnp.arange(3), jnp.arange(3)].set(jnp.nan)
+    assert np.isnan(rays(scene, places, jnp.full((3, 3), 0.1))).all()
+    assert np.isnan(rays(scene, jnp.full((3, 3), 0.1), places)).all()
+
+
 def test_a_ray_is_measured_in_lengths_of_its_direction():
     far = rays(SCENE, POINTS, DIRECTIONS)
     np.testing.assert_allclose(rays(SCENE, POINTS, 4 * DIRECTIONS), far / 4, rtol=1e-9)

@@ -12,7 +12,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
 from jaxdrones import writing
+from jaxdrones.checks import short_repr
 from jaxdrones.errors import UserError
 
 FORMAT = 4
@@ -22,9 +26,13 @@ ADVICE = "use another checkpoint, or train again"
 
 
 def save_bytes(file: Path, content: bytes, **about: Any) -> None:
-    """Write a file and its sidecar atomically."""
+    """Write a file and its sidecar atomically.
+
+    Raises:
+        ValueError: an entry of `about` that JSON cannot hold, and that would not be the same when it is read.
+    """
     sidecar = {name: _plain(x) for name, x in about.items()} | {"format": FORMAT, "sha256": _digest(content)}
-    sidecar = json.loads(json.dumps(sidecar, default=str))
+    sidecar = json.loads(json.dumps(sidecar, default=_as_json))
     sidecar["sidecar_sha256"] = _sidecar_digest(sidecar)
     file.parent.mkdir(parents=True, exist_ok=True)
     new = writing.beside(file)
@@ -114,3 +122,12 @@ def _finish(file: Path) -> None:
 
 def _plain(x):
     return dataclasses.asdict(x) if dataclasses.is_dataclass(x) else x
+
+
+def _as_json(x: Any) -> Any:
+    """Number or list in place of an array or a number of NumPy or JAX, and string in place of a path."""
+    if isinstance(x, np.generic | np.ndarray | jax.Array):
+        return np.asarray(x).tolist()
+    if isinstance(x, os.PathLike):
+        return os.fspath(x)
+    raise UserError(f"{short_repr(x)} cannot be saved beside a policy; give numbers, strings, or lists of them")

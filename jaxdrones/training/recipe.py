@@ -5,6 +5,8 @@ import inspect
 from collections.abc import Callable, Collection
 from typing import Any, Self
 
+import numpy as np
+
 from jaxdrones import user_code
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env, make
@@ -51,6 +53,7 @@ class Recipe:
 
         These are settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
         """
+        changes = {name: x.item() if isinstance(x, np.generic) else x for name, x in changes.items()}
         task, files = user_files.take_task(task)
         function = user_files.task_of(task, files)
         settings_type = learner(algorithm).Config
@@ -95,6 +98,10 @@ def split_changes(
     options -= {"task", "backend", "realistic", "options", "vision"}
     for name in changes:
         check_choice("setting", name, options.union(known))
+        if name in options and name in known:
+            raise UserError(
+                f"{name} is an option of the environment and a setting of the learner; give the option another name"
+            )
     settings = {name: x for name, x in changes.items() if name in known}
     return {name: x for name, x in changes.items() if name not in known}, settings
 

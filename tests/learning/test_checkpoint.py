@@ -6,6 +6,7 @@ import pytest
 from jaxdrones import envs
 from jaxdrones.learning import bptt, checkpoint, files
 from jaxdrones.learning.networks import Policy
+from jaxdrones.state import State
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +27,16 @@ def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
     kept = files.read_sidecar(tmp_path / "new" / "policy")
     assert kept["env"] == "hover-2021" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
+
+
+def test_a_sidecar_holds_numbers_of_any_library_as_numbers_and_refuses_what_it_would_change(tmp_path):
+    about = {"options": {"reach": np.float32(0.5), "drones": np.int64(2), "place": jnp.array([1, 2])}, "of": tmp_path}
+    checkpoint.save_tree(tmp_path / "tree", jnp.zeros(1), **about)
+    kept = files.read_sidecar(tmp_path / "tree")
+    assert kept["options"] == {"reach": 0.5, "drones": 2, "place": [1, 2]} and kept["of"] == str(tmp_path)
+    with pytest.raises(ValueError, match=r"State\(.* cannot be saved beside a policy; give numbers, strings"):
+        checkpoint.save_tree(tmp_path / "other", jnp.zeros(1), options={"start": State.at_rest(jnp.zeros((1, 3)))})
+    assert not (tmp_path / "other.json").exists()
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import pytest
 from jaxdrones import writing
 from jaxdrones.envs import make, randomize
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.recipe import Recipe, split_changes
 from jaxdrones.training.run import Progress, Run
 
 
@@ -102,6 +102,21 @@ def test_a_file_is_replaced_whole_or_stays(tmp_path):
         raise OSError(28, "No space left on device")
     with open(os.devnull, "rb"), writing.replaced(os.devnull) as new:
         assert str(new) == os.devnull
+
+
+def test_an_option_of_a_task_with_the_name_of_a_setting_is_refused_where_it_is_given():
+    def task(horizon=3, length=2.0):
+        raise AssertionError("made")
+
+    assert split_changes(task, {"length": 1.0, "worlds": 4}, {"horizon", "worlds"}) == ({"length": 1.0}, {"worlds": 4})
+    with pytest.raises(ValueError, match="horizon is an option of the environment and a setting of the learner; give"):
+        split_changes(task, {"horizon": 4}, {"horizon", "worlds"})
+
+
+def test_a_recipe_of_numbers_of_numpy_is_that_of_numbers():
+    given = Recipe.of("hover", worlds=np.int64(64), learning_rate=np.float64(0.01), reach=np.float32(0.5))
+    assert given.as_dict() == Recipe.of("hover", worlds=64, learning_rate=0.01, reach=0.5).as_dict()
+    assert type(given.options["reach"]) is float
 
 
 @pytest.mark.parametrize("realistic", [True, "any"])

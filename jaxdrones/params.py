@@ -132,7 +132,7 @@ def stack(team: Sequence[Params]) -> Params:
     check_whole("number of drones", len(team))
     for i, params in enumerate(team):
         check_single(f"mass of drone {i}", params, "stack takes the parameters of single drones")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *team)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(_real, team))
 
 
 @checked
@@ -143,7 +143,13 @@ def repeat(params: Params, n: Annotated[int, whole("number of drones")]) -> Para
         ValueError: `n` < 1, or `params` is already a team or cannot fly.
     """
     check_single("mass", params, "repeat takes the parameters of a single drone")
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), params)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), _real(params))
+
+
+def _real(params: Params) -> Params:
+    """Parameters with real numbers in place of whole ones, such as `mass=1`, except for `aux`."""
+    fields = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x, 1.0)), params.replace(aux={}))
+    return fields.replace(aux=params.aux)
 
 
 def check_single(name: str, params: Params, meaning: str) -> None:

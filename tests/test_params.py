@@ -51,6 +51,13 @@ def test_derived_quantities_of_a_team_are_those_of_its_members():
         np.testing.assert_allclose(getattr(team, name), [getattr(member, name) for member in members], rtol=RTOL)
 
 
+def test_constants_of_a_team_are_real_numbers_also_where_they_are_given_as_whole_ones():
+    params = jaxdrones.load_params("hb").replace(mass=1, gravity=np.int64(10), aux={"cells": jnp.array(3)})
+    for team in jaxdrones.repeat(params, 2), jaxdrones.stack([params, params]):
+        assert team.mass.dtype == team.gravity.dtype == team.kf.dtype and team.aux["cells"].dtype == int
+        np.testing.assert_array_equal(team.mass, [1.0, 1.0])
+
+
 def test_a_repeated_drone_is_a_stack_of_itself():
     params = jaxdrones.load_params("hb")
     assert_close(jaxdrones.repeat(params, 3), jaxdrones.stack([params] * 3), atol=0)

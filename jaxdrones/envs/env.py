@@ -20,6 +20,7 @@ from jaxdrones.envs.functions import DrawScene, check_episode, check_process, sc
 from jaxdrones.envs.observations import PrivilegedObservation, bounds, deviations, observe
 from jaxdrones.envs.randomize import Noise, Randomization
 from jaxdrones.envs.vision import ImageSpace, Vision, observation
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor
@@ -88,6 +89,12 @@ class Env:
 
     def __post_init__(self):
         check_process()
+        of_team = [model.name for model in self.physics.physics.models if model.of_team]
+        if of_team and self.task.ends == "drone":
+            raise UserError(
+                f"the model {of_team[0]!r} has a state of the whole team, and drones leave {self.task.name} one by "
+                "one; give a task that ends for the whole team (ends='team')"
+            )
         params = self.params
         if isinstance(self.disturbance, DisturbanceWithMemory):
             params = self.disturbance.nominal(params)

@@ -111,6 +111,13 @@ def test_success_is_an_rms_error_below_10_cm_and_a_largest_swing_below_15_degree
 
 
 @pytest.mark.slow
+def test_a_shared_load_is_refused_where_drones_leave_the_world_one_by_one():
+    """The first to leave would tear the load and all others away."""
+    carriers = dict(drones=3, vehicle=jd.with_payload(jd.load_params("cf2x"), 0.005, cables=3), effects=(jd.cable,))
+    with pytest.raises(ValueError, match="'payload' has a state of the whole team, and drones leave crowd one by one"):
+        make("crowd", models=(jd.payload(shared=True),), **carriers)
+
+
 def test_a_load_weighs_on_the_drone_of_a_task_and_any_task_takes_one():
     """The action 0 is the weight of the drone alone: drone and load sink by the share of the load."""
     params = jd.with_payload(jd.load_params("cf2x"), 0.009)

@@ -97,7 +97,7 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
         params = env.disturbance(jax.random.fold_in(key, DISTURBANCE), params, env.dt)
     world = world.replace(actions=actions, params=params)
     if env.task.ends == "drone":
-        world = world.replace(drones=_without_ended(world))
+        world = world.replace(drones=_without_ended(env, world))
 
     def of_drone(params, memory, state, action, setpoint):
         return env.action.rpm(params, memory, state, action, setpoint, env.dt)
@@ -111,11 +111,15 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
     return world.replace(memory=memory), rpm
 
 
-def _without_ended(world: World) -> State:
-    """State of the team, in which drones whose episode has ended are far away from the others and from each other."""
+def _without_ended(env: Any, world: World) -> State:
+    """State of the team, in which drones whose episode has ended are far away from the others and from each other.
+
+    They begin there anew, each with its load, if it has one: one that stays behind would pull the drone back.
+    """
     n, dtype = len(world.active), world.drones.pos.dtype
     place = jnp.stack([_AWAY + _APART * jnp.arange(n, dtype=dtype), jnp.zeros(n, dtype), jnp.full(n, _AWAY, dtype)], -1)
-    away = State.at_rest(place).replace(aux=jax.tree.map(jnp.zeros_like, world.drones.aux))
+    away = env.physics.init(world.params, State.at_rest(place))
+    away = away.replace(aux=jax.tree.map(jnp.zeros_like, world.drones.aux) | away.aux)
     return jax.vmap(lambda active, *states: jax.tree.map(functools.partial(jnp.where, active), *states))(
         world.active, world.drones, away
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
+import jaxdrones as jd
 from jaxdrones import envs
 from jaxdrones.control import Setpoint
 from jaxdrones.learning import bptt, collect, ppo, shac
@@ -144,6 +145,18 @@ def test_a_drone_that_left_acts_on_no_other(backend):
             _, alone, *_ = step_alone(KEY, alone, jnp.zeros((1, 4)))
             np.testing.assert_allclose(world.drones.pos[0], alone.drones.pos[0], atol=1e-6)
             np.testing.assert_allclose(world.drones.vel[0], alone.drones.vel[0], atol=1e-5)
+
+
+def test_a_drone_that_left_takes_its_load_with_it():
+    """A load left behind pulled it back at 50 km/s, which rewards for the approach of others counted."""
+    task = dataclasses.replace(column().task, effects=(jd.cable,), models=(jd.payload(),))
+    env = envs.make(task, vehicle=jd.with_payload(jd.load_params("cf2x"), 0.005), substeps=10)
+    _, world = env.reset(KEY)
+    world = world.replace(active=jnp.array([True, False]))
+    after = jit_unoptimized(env.step)(KEY, world, jnp.zeros((2, 4)))[1].drones
+    hangs = after.aux["payload"].pos - after.pos
+    np.testing.assert_allclose(hangs, jnp.broadcast_to(jnp.array([0, 0, -0.5]), (2, 3)), atol=0.01)
+    assert jnp.max(jnp.abs(after.vel)) < 1.0  # after a control period of 0.05 s, in which the second drone falls
 
 
 def test_a_state_that_is_not_finite_stays_with_its_drone():

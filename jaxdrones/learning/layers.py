@@ -15,6 +15,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning.normalize import CLIP
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
+OUTPUT_SCALE = 0.01  # of the initial outputs of policies, so that actions are near zero
 _SMALL_IMAGE = 100  # pixels, below which a stride is 2 instead of 4
 SMALL_SQUARE = 1e-8  # m^2, for the gradient of a length at zero
 FADE = 1.5  # inverse of the share of its reach in which a row of a set fades out

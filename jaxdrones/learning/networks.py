@@ -18,7 +18,7 @@ from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
-from jaxdrones.learning.layers import MLP, Network, expand, make_network
+from jaxdrones.learning.layers import MLP, OUTPUT_SCALE, Network, expand, make_network
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
 from jaxdrones.pytree import PyTreeNode
 
@@ -183,7 +183,7 @@ class Policy(PyTreeNode):
             ValueError: a network without parameters, or with the wrong output for the environment.
         """
         obs = example_observation(env)
-        own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size, env.sets, set_sizes)
+        own = make_network(obs, hidden_sizes, env.action_size, OUTPUT_SCALE, recurrent_size, env.sets, set_sizes)
         network = own if network is None else OwnNetwork(network, env.action_size)
         params = init_params(key, network, obs, env.drones if per_agent else None)
         policy = cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import ArrayLike
 
+from jaxdrones.learning.layers import OUTPUT_SCALE
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import RunningStatistics
 
@@ -29,7 +30,8 @@ def mlp_policy(
         activation: a name of `learning.layers.ACTIVATIONS`, between the layers.
         obs_stats: statistics for the normalization of observations, which are clipped at ten standard deviations. By
             default observations are not normalized, and not clipped: they are divided by 2^20 and the weights of the
-            first layer multiplied by it, which does not round. Training from such a policy keeps these statistics.
+            first layer multiplied by it, which does not round. To train such a policy further, give statistics: its
+            first layer would hardly change.
         per_agent: whether every drone has its own network.
     """
     weights = [(jnp.asarray(weight), jnp.asarray(bias)) for weight, bias in layers]
@@ -41,4 +43,5 @@ def mlp_policy(
         f"Dense_{i}": {"kernel": jnp.swapaxes(weight, -1, -2), "bias": bias} for i, (weight, bias) in enumerate(weights)
     }
     *hidden, outputs = (bias.shape[-1] for _, bias in weights)
-    return Policy({"params": params}, obs_stats, MLP(tuple(hidden), outputs, activation=activation), per_agent)
+    network = MLP(tuple(hidden), outputs, OUTPUT_SCALE, activation)  # as that of settings, for `train --from`
+    return Policy({"params": params}, obs_stats, network, per_agent)

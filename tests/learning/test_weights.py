@@ -1,9 +1,14 @@
 """Policies from the weights of other libraries."""
 
+import itertools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdrones import envs
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.weights import mlp_policy
 
 pytestmark = pytest.mark.float32
@@ -30,3 +35,14 @@ def test_the_policy_is_the_multilayer_perceptron_of_the_weights(per_agent):
     )
     np.testing.assert_allclose(jax.jit(lambda obs: policy(obs))(obs.astype(np.float32)), x, atol=1e-5)
     assert policy.per_agent == per_agent and policy.network.hidden_sizes == (5, 4)
+
+
+def test_a_training_can_start_from_the_weights_of_another_library():
+    """Their network is that of settings with its sizes; the statistics stay, as weights are scaled by 2^20."""
+    env = envs.make("hover")
+    sizes = [env.observation_size, 32, 32, env.action_size]
+    policy = mlp_policy([(np.zeros((n, m), np.float32), np.zeros(n, np.float32)) for m, n in itertools.pairwise(sizes)])
+    assert policy.network == Policy.init(jax.random.key(0), env).network
+    seen = policy.obs_stats.update(jnp.full((10**6, sizes[0]), 3.0))
+    np.testing.assert_allclose(seen.scale, policy.obs_stats.scale, rtol=1e-5)
+    np.testing.assert_allclose(seen.mean, policy.obs_stats.mean, atol=1e-5)

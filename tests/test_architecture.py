@@ -42,7 +42,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("adapters",), ("firmware",), ("learning",), ("ros2",), ("visualization",)),
     (("training",), ("export",)),
     (("cli",),),
-    (("",),),  # the package itself, which re-exports
+    (("",), ("__main__",)),  # the package itself, which re-exports, and `python -m jaxdrones`
 )
 PLACE = {
     module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group

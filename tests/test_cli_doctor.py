@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -177,6 +178,13 @@ def test_bench_measures_the_plant_a_controller_and_an_environment(capsys):
 def test_bench_refuses_what_is_no_number_of_worlds(capsys):
     assert main(["bench", "--worlds", "0"]) == 2
     assert "worlds is 0" in capsys.readouterr().err
+
+
+def test_the_package_is_the_command_for_python(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["jaxdrones", "--version"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module("jaxdrones", run_name="__main__")
+    assert stop.value.code == 0 and capsys.readouterr().out == f"jaxdrones {machine.version('jaxdrones')}\n"
 
 
 def test_the_version_is_that_of_the_package(capsys):

@@ -11,6 +11,7 @@ from jaxdrones.dynamics.aero import (
     quadratic_drag,
 )
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
+from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.inflow import inflow_thrust
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
@@ -78,6 +79,7 @@ __all__ = [
     "explain",
     "external_force",
     "failing",
+    "flapping_moment",
     "ground_contact",
     "ground_effect",
     "ground_effect_2021",
@@ -100,6 +102,7 @@ __all__ = [
     "pwm_of_thrust",
     "pwm_rotors",
     "quadratic_drag",
+    "rate_damping",
     "render",
     "repeat",
     "rk4",
@@ -109,6 +112,7 @@ __all__ = [
     "show",
     "stack",
     "supply_voltage",
+    "trim_torque",
     "vector",
     "with_payload",
 ]

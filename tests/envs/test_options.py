@@ -9,6 +9,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones import vehicles
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import TASKS, AutoReset, make
 from jaxdrones.envs.disturbances import random_pushes
 from jaxdrones.envs.randomize import AnyVehicle, constant_wind, scaled, sensor_noise, shifted
@@ -20,6 +21,11 @@ from jaxdrones.tasks.task import ObservationTerm
 CF2X = jd.load_params("cf2x")
 KEY = jax.random.key(0)
 NO_NUMBER = (np.nan, np.inf, -np.inf, "a", None, [1.0], True)
+
+
+def test_what_make_knows_by_name_is_in_the_package():
+    for table in EFFECTS, PAIRS, ROTORS, INTEGRATORS:
+        assert {function.__name__ for function in table.values()} <= set(jd.__all__)
 
 
 def refused(name, option, values):

@@ -41,8 +41,9 @@ def is_concrete(value: Any) -> bool:
 
 
 def short_repr(value: Any) -> str:
-    """Representation of a value in one short line; of an array, its numbers."""
-    text = repr(np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value)
+    """Representation of a value in one short line; of a concrete array, its numbers."""
+    is_array = isinstance(value, np.ndarray | np.generic | jax.Array) and is_concrete(value)
+    text = repr(np.asarray(value).tolist() if is_array else value)
     text = " ".join(text.split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 

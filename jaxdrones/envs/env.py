@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.arguments import Key, checked
+from jaxdrones.arguments import Fraction, Key, checked
 from jaxdrones.checks import check_shape, check_whole, is_concrete
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
@@ -195,7 +195,7 @@ class Env:
         return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
     @in_full_precision
-    def reset(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Obs, World]:
+    def reset(self, key: jax.Array, progress: Fraction = 1.0) -> tuple[Obs, World]:
         """First observation and world; `progress` is that of training in [0, 1], for a task with a curriculum."""
         obs, world = self.begin(key, progress)
         if self.vision:
@@ -204,7 +204,7 @@ class Env:
 
     @checked
     @in_full_precision
-    def begin(self, key: Key, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
+    def begin(self, key: Key, progress: Fraction = 1.0) -> tuple[Float[Array, "n d"], World]:
         """`reset` without images."""
         world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 
 from jaxdrones.accelerate.compiler import is_inside_jit
 from jaxdrones.arguments import Key, Scalar, checked
-from jaxdrones.checks import is_concrete, short_repr
+from jaxdrones.checks import check_function, is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
@@ -134,6 +134,8 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
         callbacks = (callback,) if callable(callback) else tuple(callback or ())
         if not all(map(callable, callbacks)):
             raise UserError(f"callback is {short_repr(callback)}; give functions (update, metrics, state)")
+        for one in callbacks:
+            check_function("callback", one, ("update", "metrics", "state"))
         if state is not None:
             _check_state(state, functools.partial(init, env=env, config=config), network)
         if is_inside_jit() or not all(map(is_concrete, (key, *vars(config).values()))):

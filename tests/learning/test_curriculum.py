@@ -41,3 +41,9 @@ def test_the_start_of_a_task_sees_the_progress_of_training_without_another_compi
         height = state.worlds.episodes.world.drones.pos[:, 0, 2]
         np.testing.assert_allclose(height, 1 + number / 4, atol=0.02)
     assert len(traced) == 1
+
+
+@pytest.mark.parametrize("progress", [-0.1, 1.5, "half"])
+def test_a_progress_beyond_that_of_training_is_refused(progress):
+    with pytest.raises(ValueError, match=f"progress is .*{progress}.*; give a number of at least 0 and at most 1"):
+        jd.make(HOVER).reset(KEY, progress)

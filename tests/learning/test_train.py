@@ -270,6 +270,8 @@ def test_a_state_that_does_not_fit_is_refused():
 
 
 def test_a_callback_that_is_no_function_is_refused():
+    with pytest.raises(ValueError, match=r"callback: <lambda> takes .*; give a function of \(update, metrics, state\)"):
+        bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], callback=lambda update, metrics: None)
     with pytest.raises(ValueError, match=r"callback is \[3\]; give functions"):
         bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], callback=[3])
 

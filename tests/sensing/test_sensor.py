@@ -108,6 +108,7 @@ def returning(result):
     [
         (jnp.zeros(3), r"measure of sensor 'odd' returned .*\(memory, reading\)"),
         ((jnp.zeros(2), 0.0), r"returned a memory of float64\[2\], but was given one of float64\[3\]"),
+        (None, "measure of sensor 'odd' returned None; return the two values"),
         (((), 0.0), r"returned a memory of \(\), but was given one of float64\[3\]"),
         ((jnp.zeros(3), "far"), "reading with 'far' in it; return arrays"),
     ],
@@ -115,6 +116,12 @@ def returning(result):
 def test_what_is_no_memory_and_reading_is_refused(result, message):
     with pytest.raises(ValueError, match=message):
         measure((returning(result),))
+
+
+def test_a_reading_without_a_memory_is_refused_although_it_is_traced():
+    lost = jd.Sensor("lost", lambda key, params, state, rate, scene, memory: state.pos)
+    with pytest.raises(ValueError, match=r"measure of sensor 'lost' returned .*Tracer.*; return the two values"):
+        measure((lost,))
 
 
 @pytest.mark.parametrize(

@@ -82,6 +82,7 @@ def parse_params(name: str, text: str) -> Params:
 
 def _params(urdf: "_Urdf") -> Params:
     inertial, cylinder = f"{_BASE}/inertial", f"{_BASE}/collision/geometry/cylinder"
+    urdf.check_properties()
     properties = {name: urdf.property(name) for name in PROPERTIES}
     mass = urdf.number(f"{inertial}/mass", "value", "mass, kg", _MASS)
     kf, thrust2weight = properties["kf"], properties["thrust2weight"]
@@ -219,6 +220,14 @@ class _Urdf:
                     "add it, and its inertia, to those of base_link"
                 )
 
+    def check_properties(self) -> None:
+        """Raise for missing properties, with the names of all of them."""
+        tag = self._tag("properties")
+        known = _DEFAULTS if tag is None else _DEFAULTS | tag.attrib
+        missing = [f"'{name}' ({meaning})" for name, (_, meaning, _) in PROPERTIES.items() if name not in known]
+        if missing:
+            raise UserError(f"{self.name}: <properties> lacks {', '.join(missing)}; {_found(tag)}")
+
     def property(self, name: str) -> float | np.ndarray:
         length, meaning, within = PROPERTIES[name]
         values = self.numbers("properties", name, length, meaning, within, _DEFAULTS.get(name))
@@ -235,8 +244,7 @@ class _Urdf:
         tag = self._tag(path)
         text = default if tag is None else tag.get(attribute, default)
         if text is None:
-            there = "the tag is missing" if tag is None else f"found {', '.join(tag.keys()) or 'no attribute'}"
-            raise UserError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {there}")
+            raise UserError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {_found(tag)}")
         where = f'{self.name}: <{path}> {attribute}="{short_repr(text)[1:-1]}" ({meaning})'
         try:
             values = np.array([_float(word) for word in text.split()])
@@ -263,6 +271,11 @@ class _Urdf:
                 return None
             tag = found[0]
         return tag
+
+
+def _found(tag: ET.Element | None) -> str:
+    """Attributes of a tag, for messages."""
+    return "the tag is missing" if tag is None else f"found {', '.join(tag.keys()) or 'no attribute'}"
 
 
 def _float(word: str) -> float:

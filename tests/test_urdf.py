@@ -94,6 +94,11 @@ def test_a_missing_file_says_what_to_give(tmp_path):
         ("</robot>", "", r"broken\.urdf: is not well-formed XML"),
         ("<properties", "<other", r"<properties> lacks 'kf' \(thrust coefficient.*tag is missing"),
         ('kf="3.16e-10"', "", r"<properties> lacks 'kf' \(thrust coefficient, N/RPM\^2\); found km,"),
+        (
+            'kf="3.16e-10"\n    km="7.94e-12"',
+            "",
+            r"lacks 'kf' \(thrust.*, 'km' \(torque coefficient, N m/RPM\^2\); found ",
+        ),
         ('kf="3.16e-10"', 'kf="much"', r'kf="much".*not a list of numbers; give 1'),
         ('kf="3.16e-10"', 'kf="-1e-10"', r'kf="-1e-10".*should be positive'),
         ('kf="3.16e-10"', 'kf="nan"', r'kf="nan".*1 finite number'),

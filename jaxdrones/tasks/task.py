@@ -140,7 +140,7 @@ class Task:
     """Name -> condition that truncates the episode."""
     ends: Annotated[str, arguments.choice("ends", ("team", "drone"))] = "team"
     """Episode that a condition ends: that of the `team`, or that of one `drone`, which leaves the world while the
-    others continue."""
+    others continue: it is far away, and not in `World.active`."""
     advance: Callable[[Task, World], Any] = lambda task, world: world.variables
     """(task, world after a step with the variables before it) -> variables of the task after the step."""
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)

@@ -160,6 +160,8 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
             table: dict[str, list[str]] = {name: [] for name in names}
             if len(table) < len(names):
                 raise UserError("two columns have the same name")
+            if any(";" in name for name in names):
+                raise UserError("columns are separated by semicolons; separate them by commas")
             for row in reader:
                 if None in row or None in row.values():
                     raise UserError(f"line {reader.line_num} has not {len(names)} entries, one for each column")
@@ -167,7 +169,8 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
                     entries.append(row[name])
         drones = table.pop("drone", ["drone 0"])
         labels = list(dict.fromkeys(drones))
-        numbers = {name: np.array(x, float).reshape(-1, len(labels)) for name, x in table.items()}
+        read = {name: [_number(name, line, x) for line, x in enumerate(table[name], 2)] for name in table}
+        numbers = {name: np.array(x).reshape(-1, len(labels)) for name, x in read.items()}
     except (*_DAMAGE, TypeError, csv.Error) as error:
         raise UserError(f"{file}: is not a table of numbers ({error}); give the log of a flight") from None
     t = numbers.pop("t", np.zeros((0, 1)))
@@ -180,6 +183,13 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
             stacked = np.stack([numbers[axis] for axis in axes], axis=-1)
             arrays[name] = stacked if len(axes) > 1 else stacked[..., 0]
     return arrays | {"labels": np.array(labels)}
+
+
+def _number(column: str, line: int, entry: str) -> float:
+    try:
+        return float(entry)
+    except ValueError:
+        raise UserError(f"column {column!r} has {entry[:30]!r} in line {line}") from None
 
 
 def _bag(path: Path) -> dict[str, np.ndarray]:
@@ -207,14 +217,10 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path} has no flight: /drone_0/odom or /drone_0/motors is missing; record both")
     times = sorted(set.intersection(*(set(found[f"drone_{i}/{kind}"]) for i in range(n) for kind in kinds.values())))
     if not times:
-        raise UserError(
-            f"{path}: /odom and /motors of its {n} drones have no time in common; record them with equal times"
-        )
+        raise UserError(f"{path}: /odom and /motors of its {n} drones have no time in common; record equal times")
     motors = [[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]
     if any(len(speeds) != _WIDTHS["rpm"] for team in motors for speeds in team):
-        raise UserError(
-            f"{path}: a message of /motors does not have {_WIDTHS['rpm']} numbers; record the rotor speeds, RPM"
-        )
+        raise UserError(f"{path}: a message of /motors does not have 4 numbers; record the rotor speeds, RPM")
     odometry = [[found[f"drone_{i}/odom"][ns] for i in range(n)] for ns in times]
 
     def stacked(part: str, kind: str, axes: str) -> np.ndarray:

@@ -116,6 +116,30 @@ def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tm
             np.testing.assert_allclose(getattr(read, name), getattr(log, name), rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda line: line.replace(line.split(",")[3], "", 1), r"column 'pos_y' has '' in line 5"),
+        (lambda line: line.replace(line.split(",")[3], "far", 1), r"column 'pos_y' has 'far' in line 5"),
+    ],
+)
+def test_an_entry_of_a_table_that_is_no_number_is_named(change, message, columns, tmp_path):
+    save_csv(written(tmp_path, columns), tmp_path / "flight.csv")
+    lines = (tmp_path / "flight.csv").read_text().splitlines()
+    lines[4] = change(lines[4])
+    (tmp_path / "flight.csv").write_text("\n".join(lines))
+    with pytest.raises(ValueError, match=message):
+        read_log(tmp_path / "flight.csv")
+
+
+def test_a_table_with_semicolons_is_refused(tmp_path):
+    (tmp_path / "flight.csv").write_text("t;pos_x\n0.0;1.0\n")
+    with pytest.raises(
+        ValueError, match=r"flight\.csv: is not a table of numbers \(columns are separated by semicolons;"
+    ):
+        read_log(tmp_path / "flight.csv")
+
+
 def test_a_table_that_mixes_drones_or_times_is_refused(columns, tmp_path):
     """Rows of two drones belong together by time; a table says which is whose, so no other order is guessed."""
     one = written(tmp_path, columns)

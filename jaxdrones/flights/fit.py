@@ -79,8 +79,9 @@ def fit(
     The vehicle is simulated over windows of half a second from their logged starts, and Levenberg-Marquardt steps
     minimize the squared differences from the log after 0.1, 0.25 and 0.5 s: first at the nearest horizon, then at all
     of them. Each residual is divided by its robust scale in its flight, and a Cauchy loss reduces the weight of
-    outlying windows. Without `names`, flights on set-points without rotor speeds are simulated as a whole, in closed
-    loop with the firmware's PID: see `fit_path`.
+    outlying windows. Without `names`, a drag, damping or rotor inertia that would be negative is zero, and the others
+    are fitted again without it. Without `names`, flights on set-points without rotor speeds are simulated as a whole,
+    in closed loop with the firmware's PID: see `fit_path`.
 
     Args:
         logs: flights to fit, all with rotor speeds or all without.
@@ -112,7 +113,12 @@ def fit(
     default = parameters.FROM_ROTOR_SPEEDS if kinds.pop() else parameters.FROM_PWM
     names = parameters.select_parameters(names) if named else default
     parameters.check_guess(Vehicle.of(params), names)
-    return _Problem(logs, params, names, motors).solve(validate, named, progress)
+    report = _Problem(logs, params, names, motors).solve(validate, named, progress)
+    while not named and (negative := parameters.negative(report.vehicle, names)):
+        progress(f"{', '.join(negative)} would be negative; fitting again with zero in place of them")
+        params, names = parameters.without(params, negative), tuple(name for name in names if name not in negative)
+        report = _Problem(logs, params, names, motors).solve(validate, named, progress)
+    return report
 
 
 def _fit_paths(

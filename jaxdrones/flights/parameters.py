@@ -12,6 +12,7 @@ from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 
 _MAX_PARAMETERS = 60
+_NOT_NEGATIVE = ("rotor_inertia", "drag_coeff", "rate_damping")
 _HOVER_SUMMED_SPEED = 6900.0  # rad/s, sum of the four rotor speeds, about that of a hovering Crazyflie
 
 
@@ -93,6 +94,19 @@ def check_guess(vehicle: Vehicle, names: Sequence[str]) -> None:
         raise UserError(
             f"the vehicle has a {zero[0]} of 0, of which a fit finds a multiple; give a vehicle with a first guess"
         )
+
+
+def negative(vehicle: Vehicle, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the parameters that are negative and must not be."""
+    return tuple(name for name in names if PARAMETERS[name].field in _NOT_NEGATIVE and value_of(vehicle, name) < 0)
+
+
+def without(params: Params, names: Sequence[str]) -> Params:
+    """Parameters of one drone with zero in place of those of these names."""
+    for name in names:
+        field = PARAMETERS[name].field
+        params = params.replace(**{field: getattr(params, field).at[PARAMETERS[name].index].set(0)})
+    return params
 
 
 def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[ArrayLike]) -> Vehicle:

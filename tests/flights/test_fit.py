@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import json
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -159,6 +160,30 @@ def test_the_firmware_has_the_gains_of_the_propellers(monkeypatch, tmp_path):
     ((_, _, motors, gains, _),) = given
     jax.tree.map(np.testing.assert_array_equal, gains, firmware_pid.gains(propellers="2.1"))
     jax.tree.map(np.testing.assert_array_equal, motors, crazyflie_motors("2.1"))
+
+
+def test_a_default_fit_repeats_without_parameters_that_would_be_negative(flown, monkeypatch):
+    """Perfect logs gave a damping of -2e-6 +- 4e-7 N m s, and a vehicle that no command accepted."""
+    params, log = flown
+    problems, said = [], []
+
+    class Fitted:
+        def __init__(self, logs, start, names, motors):
+            self.start, self.names = start, names
+            problems.append(self)
+
+        def solve(self, validate, named, progress):
+            noise = jnp.array([1e-6, 1e-6, -2e-6]) * ("rate_damping_z" in self.names)
+            return SimpleNamespace(vehicle=Vehicle.of(self.start.replace(rate_damping=self.start.rate_damping + noise)))
+
+    monkeypatch.setattr(importlib.import_module("jaxdrones.flights.fit"), "_Problem", Fitted)
+    start = params.replace(rate_damping=jnp.array([0.0, 0.0, 1e-6]))
+    assert fit([log], start, progress=said.append).vehicle.params.rate_damping.tolist() == [0, 0, 0]
+    first, second = problems
+    assert set(first.names) - set(second.names) == {"rate_damping_z"}
+    assert said == ["rate_damping_z would be negative; fitting again with zero in place of them"]
+    fit([log], start, ("rate_damping",))
+    assert len(problems) == 3  # named parameters are the user's choice
 
 
 def test_a_fitted_vehicle_that_no_command_accepts_is_written_with_a_warning(monkeypatch, tmp_path, capsys):

@@ -71,6 +71,9 @@ def load_params(vehicle: str | os.PathLike) -> Params:
         raise UserError(f"vehicle is {short_repr(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
+        found = sorted(path.glob("*.urdf")) if str(vehicle) not in assets.vehicles() else []
+        if found:
+            raise UserError(f"vehicle is the folder {str(vehicle)!r}; give the file, {str(found[0])!r}")
         path = look_up("vehicle", str(vehicle), assets.vehicles())
     return _params(_Urdf(path))
 

@@ -83,6 +83,16 @@ def test_an_unknown_vehicle_lists_the_known_ones():
         jaxdrones.load_params("cf3x")
 
 
+def test_a_folder_of_a_fit_names_the_vehicle_in_it(tmp_path, monkeypatch):
+    for folder in "fit", "cf2x":
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "vehicle.urdf").write_text("")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"vehicle is the folder 'fit'; give the file, 'fit/vehicle\.urdf'"):
+        jaxdrones.load_params("fit")
+    assert jaxdrones.load_params("cf2x")  # a name of a bundled vehicle comes first
+
+
 def test_a_missing_file_says_what_to_give(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere\.urdf.*cannot be read.*path of a URDF"):
         jaxdrones.load_params(tmp_path / "nowhere.urdf")

@@ -169,10 +169,10 @@ _REALISTIC_PRACTICE_OPTIONS: dict[tuple[str, bool | str], dict[str, Any]] = {
     ("hover", True): dict(
         delay=(0.0, 0.05),
         randomize=realistic_randomization(
-            mass=(0.87, 1.1),
+            mass=(0.85, 1.1),
             inertia=(0.75, 1.25),
-            kf=(0.9, 1.13),
-            km=(0.2, 1.35),
+            kf=(0.9, 1.15),
+            km=(0.15, 1.35),
             rotor_rise_time=(0.75, 1.25),
             rotor_fall_time=(0.1, 1.35),
         ),

@@ -37,8 +37,8 @@ test: .venv/installed
 test-slow: .venv/installed  ## all of them, or a part: make test-slow ONLY="--shard 2/6 --since '3 hours ago'"
 	$(BIN)/pytest -n 2 --dist load -m slow $(ONLY)
 
-test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax and JaxMARL, in a separate environment
-	.venv-libraries/bin/pytest tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)
+test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax, JaxMARL, W&B and MLflow, in a separate environment
+	.venv-libraries/bin/pytest tests/learning/test_loggers.py tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)
 
 test-rllib: .venv-rllib/installed
 	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/test_examples.py -k rllib
@@ -70,7 +70,7 @@ viewer:  ## the page of the viewer, from its sources; needs Node.js
 	$(PYTHON) -m venv .venv-libraries
 	.venv-libraries/bin/pip install --quiet torch==2.13.0
 	.venv-libraries/bin/pip install --quiet -e ".[cli,pettingzoo,video]" torchrl==0.14.1 skrl==2.1.1 tianshou==2.0.1 stable-baselines3==2.9.2 \
-		gymnax==1.0.1 jaxmarl==0.2.0 six beartype pytest
+		gymnax==1.0.1 jaxmarl==0.2.0 wandb==0.31.0 mlflow-skinny==3.17.2 six beartype pytest
 	touch $@
 
 # RLlib pins an older gymnasium.

@@ -21,6 +21,7 @@ from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 
+_MAX_RATE_RATIO = 20.0  # of the learning rates of critic and policy
 _MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponential
 
 
@@ -47,8 +48,8 @@ class Config(settings.Config):
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
     critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
     critic_learning_rate: arguments.Positive | None = None
-    """Learning rate of the critic; `None` for that of the policy, which `target_kl` may keep too low for a critic of
-    random vehicles."""
+    """Learning rate of the critic, but not more than 20 times that of the policy; `None` for that of the policy, which
+    `target_kl` may keep too low for the values of random vehicles."""
     centralized_critic: arguments.Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
     privileged_critic: arguments.Switch = False
@@ -190,7 +191,7 @@ def _learn(
     """Epochs of gradient steps on a trajectory: (policy parameters, log_std, critic), optimizer state, metrics."""
     batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise, ends_alone))
     rate, critic_rate = state.learning_rate, config.critic_learning_rate
-    rates = rate, rate, rate if critic_rate is None else critic_rate
+    rates = rate, rate, rate if critic_rate is None else jnp.minimum(critic_rate, _MAX_RATE_RATIO * rate)
 
     def cost(variables, minibatch):
         params, log_std, critic = variables

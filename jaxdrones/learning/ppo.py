@@ -47,8 +47,8 @@ class Config(settings.Config):
     minibatches: arguments.Count = 8
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
     critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
-    critic_learning_rate: arguments.Positive | None = None
-    """Learning rate of the critic, but not more than 20 times that of the policy; `None` for that of the policy, which
+    critic_learning_rate: arguments.NotNegative = 0.0
+    """Learning rate of the critic, but not more than 20 times that of the policy; 0 for that of the policy, which
     `target_kl` may keep too low for the values of random vehicles."""
     centralized_critic: arguments.Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
@@ -190,8 +190,8 @@ def _learn(
 ):
     """Epochs of gradient steps on a trajectory: (policy parameters, log_std, critic), optimizer state, metrics."""
     batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise, ends_alone))
-    rate, critic_rate = state.learning_rate, config.critic_learning_rate
-    rates = rate, rate, rate if critic_rate is None else jnp.minimum(critic_rate, _MAX_RATE_RATIO * rate)
+    rate, own = state.learning_rate, config.critic_learning_rate
+    rates = rate, rate, jnp.where(own > 0, jnp.minimum(own, _MAX_RATE_RATIO * rate), rate)
 
     def cost(variables, minibatch):
         params, log_std, critic = variables

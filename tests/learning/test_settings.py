@@ -34,7 +34,7 @@ def numbers(learner):
 
 def nonsense_of(name, default):
     yield from (-1, np.nan, -np.inf, "a", None, [1.0], True, 1j)
-    if name not in ZERO_MAKES_SENSE:
+    if name not in ZERO_MAKES_SENSE and default != 0:
         yield 0
     if name not in INFINITY_MAKES_SENSE:
         yield np.inf

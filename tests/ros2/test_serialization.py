@@ -9,6 +9,8 @@ import pytest
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
 
+pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_parse':DeprecationWarning")  # imported by rclpy's parser
+
 TYPES = sorted(msg.MESSAGES)
 TEXT = "drone_0/base_link é"
 VALUES = {"bool": True, "uint8": 200, "int32": -7, "uint32": 2**32 - 3, "string": TEXT}

@@ -9,7 +9,7 @@ import pytest
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
 
-pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_parse':DeprecationWarning")  # imported by rclpy's parser
+pytestmark = pytest.mark.filterwarnings("default")  # of what rclpy imports
 
 TYPES = sorted(msg.MESSAGES)
 TEXT = "drone_0/base_link é"

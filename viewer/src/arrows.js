@@ -12,11 +12,11 @@ const UP = new Vector3(0, 0, 1);
 export const THRUST = "#e69f00", FORCE = "#d55e00", TORQUE = "#0072b2", CONTACT = "#009e73";
 const THRUST_ARMS = 1.6; // length of the arrow of a rotor that carries its quarter of the weight, arms
 const FORCE_ARMS = 3; // of a resultant or contact force that equals the weight
+const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 const TARGET_ARMS = 0.55; // half the height of the mark of a target, as large as its drone would be drawn there
 const PAD_ARMS = 2.5; // radius of the ring on the ground about a target that is not higher than an arm
 const BEHIND = { transparent: true, opacity: 0.3, depthTest: false, depthWrite: false };
 const ON_GROUND = { polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -4 };
-const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 
 /** Instances that are set anew in every frame. */
 export class Marks {
@@ -101,10 +101,10 @@ export class Arrows {
       }
       if (targets) {
         const known = world.target(row, i, v), low = known && this.stage.hasGround && Math.abs(v.z) < this.arms[i];
-        const arm = this.arms[i] * fleet.scale(world.vehicle[i], v.add(offset)) * (ghost ? 0.6 : 1), size = TARGET_ARMS * arm;
+        const drawn = this.arms[i] * fleet.scale(world.vehicle[i], v.add(offset)) * (ghost ? 0.6 : 1); // arm of a drone there
+        const size = TARGET_ARMS * drawn, pad = PAD_ARMS * drawn;
         const matrix = known ? this.targets.matrix.compose(v, r.identity(), w.set(size, size, size)) : NOWHERE;
         for (const { mesh } of [this.targets, this.insides]) mesh.setMatrixAt(i, matrix);
-        const pad = PAD_ARMS * arm;
         this.pads.mesh.setMatrixAt(i, low ? this.pads.matrix.compose(v.setZ(offset.z), r.identity(), w.set(pad, pad, 1)) : NOWHERE);
       }
     }

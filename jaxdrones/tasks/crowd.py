@@ -52,21 +52,17 @@ def crowd(
     longest = side * (_LONGEST if random_box else 1)
     balls = round(obstacles * side**3)
     duration = patience * (_SETTLING + math.hypot(longest, side, side) / crossing.SPEED)
-    middle = np.array([[0, 0, FLOOR + side / 2]])
+    middle = np.array([0, 0, FLOOR + side / 2])
 
     def scene(key: jax.Array) -> Scene:
         pos_key, radius_key = jax.random.split(key)
-        pos = middle + jax.random.uniform(pos_key, (balls, 3), minval=-side / 2, maxval=side / 2)
+        pos = middle[None] + jax.random.uniform(pos_key, (balls, 3), minval=-side / 2, maxval=side / 2)
         radius = jax.random.uniform(radius_key, (balls,), minval=_RADII[0], maxval=_RADII[1])
         return Scene.of(Sphere(pos=pos, radius=radius))
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """Nearly at rest at random places in the box."""
-        box_key, start_key, place_key, goal_key = jax.random.split(key, 4)
-        sides = _random_sides(box_key, side) if random_box else jnp.full(3, side)
-        radius = jnp.max(params.collision_radius)
-        place, goal = (_places(k, drones, middle, sides, scene, radius) for k in (place_key, goal_key))
-        state = thrown(start_key, params, place, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
+        state, goal = in_box(key, params, scene, middle, side, random_box)
         return state, crossing.variables(state, goal)
 
     return crossing.task(
@@ -82,6 +78,17 @@ def crowd(
     )
 
 
+def in_box(
+    key: jax.Array, params: Params, scene: Scene, middle: np.ndarray, side: float, random_box: bool
+) -> tuple[State, Float[Array, "n 3"]]:
+    """Drones nearly at rest at random places of a cube about `middle` (m), or of a random box, and random goals."""
+    box_key, start_key, place_key, goal_key = jax.random.split(key, 4)
+    sides = _random_sides(box_key, side) if random_box else jnp.full(3, side)
+    n, radius = len(params.mass), jnp.max(params.collision_radius)
+    place, goal = (_places(k, n, middle, sides, scene, radius) for k in (place_key, goal_key))
+    return thrown(start_key, params, place, reach=0.0, speed=0.1, omega=0.1, tilt=0.1), goal
+
+
 def _random_sides(key: jax.Array, side: float) -> Float[Array, "3"]:
     """Sides of a random box, m."""
     sides_key, which_key, long_key = jax.random.split(key, 3)
@@ -94,7 +101,7 @@ def _places(
     key: jax.Array, n: int, middle: np.ndarray, sides: Array, scene: Scene, radius: Array
 ) -> Float[Array, "n 3"]:
     """Random places in a box, apart from each other and from obstacles where one of the tries is."""
-    tries = jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None] + middle[None]
+    tries = jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None] + middle[None, None]
     spacing = _SPACING * radius
     clear = jnp.full((n, _TRIES), jnp.inf)
     if scene.has_obstacles:

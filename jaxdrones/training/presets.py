@@ -158,7 +158,7 @@ _BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("shac",), "landing": ("bptt
 _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "gates": dict(random_start=True),
     "crowd": dict(random_box=True, density=1.5, substeps=2),
-    "swap-goals": dict(substeps=2),
+    "swap-goals": dict(random_places=True, substeps=2),
     "race": dict(random_start=True, contact=False, substeps=2),
     "sling": dict(substeps=2),
     "transport": dict(substeps=2),

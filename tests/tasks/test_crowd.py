@@ -171,3 +171,19 @@ def test_the_longer_the_patience_the_longer_the_episode():
     assert make("crowd", patience=2.0).steps == pytest.approx(2 * make("crowd").steps, abs=1)
     with pytest.raises(ValueError, match="patience"):
         make("crowd", patience=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+def test_in_half_of_the_trainings_of_swap_goals_drones_start_in_a_box():
+    env = make("swap-goals", drones=8, random_places=True)
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))
+    pos, goal = np.asarray(worlds.drones.pos), np.asarray(worlds.variables["goal"])
+    on_ring = np.abs(np.linalg.norm(goal[..., :2], axis=-1) - 1).max(axis=1) < 1e-3
+    assert 0.35 < np.mean(on_ring) < 0.65
+    np.testing.assert_allclose(goal[on_ring][..., 2], 2.0, rtol=1e-6)
+    assert np.all(np.abs(pos[on_ring] - np.array([0, 0, 2])).max(axis=(1, 2)) < 1.2)
+    assert np.min(np.ptp(pos[~on_ring], axis=1).min(axis=1)) > 0.3, "a box, not a ring"
+    for places in (pos, goal):
+        apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9 * np.eye(8)
+        assert apart.min() > 4 * float(env.params.collision_radius[0])

@@ -6,6 +6,7 @@ tangent space.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_shape, is_concrete, short_repr
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -55,7 +57,11 @@ def difference(params: Params, state: State, reference: State) -> Float[Array, "
         world; angular velocity, rad/s, body; rotor speeds over that of hover; states of models in their own units. d is
         16 without models.
     """
-    parts = (
+    return ravel_pytree(_parts(params, state, reference))[0]
+
+
+def _parts(params: Params, state: State, reference: State) -> tuple[Any, ...]:
+    return (
         state.pos - reference.pos,
         small_turn(reference.quat, state.quat),
         state.vel - reference.vel,
@@ -63,7 +69,6 @@ def difference(params: Params, state: State, reference: State) -> Float[Array, "
         (state.rpm - reference.rpm) / command_unit(params),
         jax.tree.map(jnp.subtract, state.aux, reference.aux),
     )
-    return ravel_pytree(parts)[0]
 
 
 def small_turn(quat: Float[Array, "4"], after: Float[Array, "4"]) -> Float[Array, "3"]:
@@ -87,11 +92,11 @@ def displaced(params: Params, state: State, vector: Float[Array, " d"]) -> State
 
 
 def tracking_error(params: Params, state: State, reference: State) -> Float[Array, " d"]:
-    """`difference` with position and velocity along the heading of the reference instead of the world's axes.
+    """`difference` with positions and velocities along the heading of the reference instead of the world's axes.
 
     Weights and gains are then independent of the heading.
     """
-    vector = difference(params, state, reference)
+    pos, turn, vel, omega, rpm, aux = _parts(params, state, reference)
     x_axis = rotation.axes(reference.quat)[0]
     x, y = x_axis[0], x_axis[1]
     length = jnp.sqrt(jnp.maximum(x * x + y * y, jnp.finfo(x.dtype).tiny))
@@ -100,7 +105,17 @@ def tracking_error(params: Params, state: State, reference: State) -> Float[Arra
     def along(v: Array) -> Array:
         return jnp.stack([cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]])
 
-    return vector.at[:3].set(along(vector[:3])).at[6:9].set(along(vector[6:9]))
+    aux = of_point_masses(lambda x: PointMass(along(x.pos), along(x.vel)), aux)
+    return ravel_pytree((along(pos), turn, along(vel), omega, rpm, aux))[0]
+
+
+def of_point_masses(function: Callable[[PointMass], PointMass], aux: dict[str, Any]) -> dict[str, Any]:
+    """States of models with a function of those that are point masses, such as loads."""
+
+    def of(x: Any) -> Any:
+        return function(x) if isinstance(x, PointMass) else x
+
+    return jax.tree.map(of, aux, is_leaf=lambda x: isinstance(x, PointMass))
 
 
 def linearize_step(

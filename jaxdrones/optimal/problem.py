@@ -13,8 +13,9 @@ from jaxdrones.arguments import whole
 from jaxdrones.checks import check_shape, is_concrete, short_repr
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
-from jaxdrones.optimal.coordinates import command_unit, small_turn
+from jaxdrones.optimal.coordinates import command_unit, of_point_masses, small_turn
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -94,7 +95,8 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     """Reference motion through setpoints by differential flatness (Mellinger, Kumar 2011).
 
     Thrust and attitude are those of the acceleration and heading; angular velocities and torques are differences of
-    attitudes over `dt` (s). The angular velocity of the H + 1 >= 3 setpoints is not used; `aux` are states of models.
+    attitudes over `dt` (s). The angular velocity of the H + 1 >= 3 setpoints is not used. `aux` are states of models of
+    a drone at the origin; point masses, such as loads, follow the setpoints.
     """
     quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
     omega = _with_last(jax.vmap(small_turn)(quat[:-1], quat[1:]) / dt)
@@ -104,7 +106,8 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     )
     length = len(thrust)
     shared = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x))), aux)
-    return Reference(State(setpoints.pos, quat, setpoints.vel, omega, rpm, shared), rpm)
+    along = of_point_masses(lambda x: PointMass(x.pos + setpoints.pos, setpoints.vel), shared)
+    return Reference(State(setpoints.pos, quat, setpoints.vel, omega, rpm, along), rpm)
 
 
 def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> tuple[Array, Array]:
@@ -128,12 +131,12 @@ def _with_last(x: Float[Array, "k 3"], times: int = 1) -> Float[Array, "_ 3"]:
 
 
 def hover(params: Params, state: State) -> State:
-    """Level hover of one drone at the origin, heading along x, with the models of `state`."""
+    """Level hover of one drone at the origin, heading along x, with the models of `state` around it."""
     zero = jnp.zeros_like(state.pos)
     quat = jnp.zeros_like(state.quat).at[3].set(1)
-    return state.replace(
-        pos=zero, quat=quat, vel=zero, omega=zero, rpm=jnp.broadcast_to(command_unit(params), state.rpm.shape)
-    )
+    rpm = jnp.broadcast_to(command_unit(params), state.rpm.shape)
+    aux = of_point_masses(lambda x: PointMass(x.pos - state.pos, zero), state.aux)
+    return state.replace(pos=zero, quat=quat, vel=zero, omega=zero, rpm=rpm, aux=aux)
 
 
 def posed(
@@ -154,7 +157,7 @@ def posed(
     zero = jax.tree.map(jnp.zeros_like, setpoints)
     given, safe = (state, setpoints), (rest, zero)
     state, setpoints = jax.tree.map(lambda x, y: jnp.where(valid, x, y), given, safe)
-    return valid, state, reference(params, setpoints, state.aux, dt)
+    return valid, state, reference(params, setpoints, hover(params, state).aux, dt)
 
 
 def check_plan(

@@ -11,8 +11,10 @@ from helpers import VEHICLES, flying, jit_unoptimized
 import jaxdrones as jd
 from jaxdrones import optimal
 from jaxdrones.control import Setpoint
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.optimal import lqr
-from jaxdrones.optimal.problem import hover
+from jaxdrones.optimal.coordinates import tracking_error
+from jaxdrones.optimal.problem import hover, posed
 from jaxdrones.status import PlanningError, Status
 
 DT = 1 / 100
@@ -92,6 +94,30 @@ def test_the_command_does_not_depend_on_the_heading():
     target = Setpoint.at(rotate(target.pos), rotate(target.vel), rotate(target.acc), target.yaw + 1.1)
     _, again = lqr.control(settings, params, memory, turned, target, dt=DT)
     np.testing.assert_allclose(again, rpm, rtol=1e-9)
+
+
+def test_the_error_of_a_drone_with_a_load_depends_neither_on_the_place_nor_on_the_heading():
+    """The load moves and turns with target and drone; in hover at the origin it is as far from the drone as now."""
+    team = jd.with_payload(team_of("cf2x"), mass=0.005, length=0.3)
+    settings, params = lqr.settings(make_step((jd.drag, jd.cable), models=(jd.payload(),), dt=DT)), one(team)
+
+    @jit_unoptimized
+    def error(place, angle):
+        turn = jd.rotation.exp(jnp.array([0.0, 0.0, 1.0]) * angle)
+        ahead, swing, moving = (
+            jd.rotation.rotate(turn, jnp.array(v)) for v in ([0.2, 0.1, 0.0], [0.03, -0.02, -0.3], [0.1, 0.2, 0.0])
+        )
+        load = PointMass(place + swing, moving)
+        state = one(hovering(team)).replace(pos=place, quat=turn, aux={"payload": load})
+        target = Setpoint.at(jnp.tile(place + ahead, (3, 1)), yaw=jnp.full(3, angle))
+        _, _, motion = posed(settings, params, None, state, target, DT, "hold")
+        at_rest = hover(params, state).aux["payload"].pos
+        return tracking_error(params, state, one(motion.state)), jd.rotation.rotate_inverse(turn, at_rest)
+
+    (there, hanging), (here, swing) = error(jnp.array([1.0, -2.0, 3.0]), 1.1), error(jnp.zeros(3), 0.0)
+    np.testing.assert_allclose(there, here, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(hanging, swing, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(here[16:], [-0.2, -0.1, 0, 0.1, 0.2, 0], rtol=0, atol=1e-12)
 
 
 @pytest.mark.float32

@@ -109,7 +109,8 @@ def _resampled(log: FlightLog) -> FlightLog:
         return np.stack(columns, axis=-1).reshape(-1, *x.shape[1:])
 
     arrays: dict[str, Any] = {name: interpolated(getattr(log, name)) for name in STATE | OPTIONAL if log.has(name)}
-    arrays["quat"] = Slerp(times, Rotation.from_quat(np.array(log.quat[:, 0])))(t).as_quat()[:, None]
+    turn = Slerp(times, Rotation.from_quat(np.array(log.quat[:, 0])))
+    arrays["quat"] = turn(np.minimum(t, times[-1])).as_quat()[:, None]  # the last time may be rounded
     if log.has("target_yaw"):
         arrays["target_yaw"] = interpolated(np.unwrap(log.target_yaw, axis=0))
     arrays |= {name: np.asarray(np.nan) for name in OPTIONAL if not log.has(name)}

@@ -198,3 +198,21 @@ def test_a_log_in_which_not_all_motors_ever_run_is_refused_in_one_line(running, 
     np.savez(tmp_path / "z.npz", **columns)
     assert main(["score", str(tmp_path / "z.npz"), "--vehicle", "cf21"]) == 2
     assert "the motors never run for 0.5 s without interruption; give a log of a flight" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("period", [1 / 120, 1 / 200, 1 / 500])
+def test_a_log_whose_times_are_sums_of_periods_is_resampled_up_to_its_last_row(tmp_path, period):
+    """Rounded sums end a little before the last multiple of 10 ms."""
+    rows = round(3 / period) + 1
+    t = np.cumsum(np.full(rows, period))
+    assert 0 < t[0] + 3 - t[-1] < 1e-9
+    angle = 0.3 * t[:, None] * np.array([0.0, 0.0, 1.0])
+    still = {name: np.zeros((rows, 3)) for name in ("pos", "vel", "omega")}
+    log = load(
+        tmp_path,
+        still | {"t": t, "quat": Rotation.from_rotvec(angle).as_quat(), "rpm": np.full((rows, 4), 15_000.0)},
+        allow_inconsistent=True,
+    )
+    assert len(log.t) == 301
+    turned = Rotation.from_quat(log.quat[:, 0]).as_rotvec()
+    np.testing.assert_allclose(turned[:, 2], 0.3 * log.t, atol=1e-9)

@@ -3,7 +3,7 @@
 Williams et al. 2017, "Information theoretic MPC for model-based reinforcement learning": the samples are weighted by
 exp(-cost / temperature). Every sample is simulated with the regulator's feedback, so the samples are corrections of a
 stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Williams et al. 2018). The temperature is
-relative to the spread of the costs, and the cost of the noise itself is left out.
+relative to the spread of the costs above the lowest one, and the cost of the noise itself is left out.
 """
 
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ class Settings(lqr.Settings, kw_only=True):
     noise: Array
     """(4,) standard deviation of sampled commands in collective, roll, pitch and yaw, over the hover speed."""
     temperature: Array
-    """() in standard deviations of the samples' costs."""
+    """() over the root mean square of the samples' costs above the lowest one."""
     samples: int = flax.struct.field(pytree_node=False)
     """Samples per call of `control`."""
     hold: int = flax.struct.field(pytree_node=False)
@@ -60,14 +60,14 @@ def settings(
     weights: Weights | None = None,
     horizon: Horizon = 24,
     samples: Count = 256,
-    temperature: Annotated[float, number("standard deviations", at_least=0)] = 0.3,
+    temperature: Annotated[float, number(at_least=0)] = 0.3,
     hold: Count = 3,
 ) -> Settings:
     """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
     The terminal cost after `horizon` control steps, at least two, is that of the regulator of `lqr`. The temperature is
-    in standard deviations of the costs of the samples; a lower value favors the best sample. `hold` control steps lie
-    between samples of the noise: noise at every step hardly moves a drone.
+    over the root mean square of the costs of the samples above the lowest one; a lower value favors the best sample.
+    `hold` control steps lie between samples of the noise: noise at every step hardly moves a drone.
     """
     return Settings(
         checked_weights(weights),
@@ -122,9 +122,10 @@ def control(
 
 
 def importance(costs: Float[Array, " k"], temperature: Float[Array, ""]) -> Float[Array, " k"]:
-    """Weights of the samples, exp(-cost / (temperature x standard deviation of the costs)); their sum is one.
+    """Weights of the samples, exp(-cost / (temperature x spread)) up to a factor that makes their sum one.
 
-    A sample with a cost that is not finite has weight zero; without any finite cost all weights are equal.
+    The spread is the root mean square of the finite costs above the lowest one. A sample with a cost that is not finite
+    has weight zero; without any finite cost all weights are equal.
     """
     finite = jnp.isfinite(costs)
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))

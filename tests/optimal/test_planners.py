@@ -58,6 +58,9 @@ def test_importance_prefers_what_costs_less_and_leaves_out_what_is_not_finite():
     weights = np.asarray(jax.jit(importance)(jnp.array([3.0, 1.0, jnp.inf, 2.0, jnp.nan]), 0.5))
     assert weights[1] > weights[3] > weights[0] > 0 and weights[2] == weights[4] == 0
     np.testing.assert_allclose(np.sum(weights), 1, rtol=1e-12)
+    above = np.array([2.0, 0, 1])  # the lowest cost
+    law = np.exp(-above / (0.5 * np.sqrt(np.mean(above**2))))
+    np.testing.assert_allclose(weights[[0, 1, 3]], law / np.sum(law), rtol=1e-12)
     np.testing.assert_allclose(jax.jit(importance)(jnp.ones(4), 0.5), 0.25, rtol=1e-12)
 
 

@@ -136,7 +136,8 @@ class FlightLog:
         """Log of one drone of a team."""
         arrays: dict[str, Any] = {name: getattr(self, name)[:, i : i + 1] for name in STATE | OPTIONAL}
         params = jax.tree.map(lambda x: x[i : i + 1], self.params)
-        return dataclasses.replace(self, **arrays, labels=self.labels[i : i + 1], params=params)
+        images = {kind: ImageSequence(x.t, x.frames[:, i : i + 1]) for kind, x in self.images.items()}
+        return dataclasses.replace(self, **arrays, labels=self.labels[i : i + 1], params=params, images=images)
 
     @property
     def in_flight(self) -> np.ndarray:

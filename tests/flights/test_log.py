@@ -11,7 +11,7 @@ import pytest
 from jaxdrones.cli import main
 from jaxdrones.firmware.drone import Recorder, Sample
 from jaxdrones.flights import FlightLog, load_flights, read_log, save_csv, save_npz
-from jaxdrones.flights.log import OPTIONAL, STATE
+from jaxdrones.flights.log import OPTIONAL, STATE, ImageSequence
 from jaxdrones.urdf import load_params
 
 
@@ -103,6 +103,14 @@ def test_a_log_is_made_of_arrays_with_a_drone_axis_and_saved_to_a_new_folder(col
     for name, wrong in ("pos", columns["pos"]), ("quat", columns["quat"]), ("vel", arrays["vel"][1:]):
         with pytest.raises(ValueError, match=rf"{name} of a log has shape \(.*; give \(K, n, \d\) of K times and n"):
             FlightLog(columns["t"], **(arrays | {name: wrong}))
+
+
+def test_the_log_of_a_drone_of_a_team_has_its_images_and_is_read_as_it_was_written(columns, tmp_path):
+    arrays = {name: np.repeat(np.asarray(columns[name])[:, None], 2, axis=1) for name in STATE}
+    frames = np.arange(3 * 2 * 4 * 5, dtype=np.float32).reshape(3, 2, 4, 5)
+    team = FlightLog(columns["t"], **arrays, images={"depth": ImageSequence(np.arange(3.0), frames)})
+    save_npz(team.drone(1), tmp_path / "log.npz")
+    np.testing.assert_array_equal(read_log(tmp_path / "log.npz").images["depth"].frames, frames[:, 1:])
 
 
 def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tmp_path):

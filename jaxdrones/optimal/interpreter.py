@@ -128,7 +128,11 @@ def _moved(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
         size = inputs[i].size
         positions[i] = jnp.arange(start, start + size, dtype=jnp.int32).reshape(inputs[i].shape)
         start += size
-    bound = equation.primitive.bind(*positions, **equation.params)
+    params = equation.params
+    if equation.primitive.name == "gather":  # beyond the array is a number of its own
+        fill = params["fill_value"]
+        items, params = np.append(items, np.nan if fill is None else fill), params | {"fill_value": len(items)}
+    bound = equation.primitive.bind(*positions, **params)
     moved = bound if equation.primitive.multiple_results else [bound]
     return [items[np.asarray(x)] if np.ndim(x) else _array([items[int(x)]], ()) for x in moved]
 
@@ -181,8 +185,8 @@ def _accumulated(function: Callable) -> Callable[[Equation, list[np.ndarray]], l
     def accumulate(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
         axis, backward = equation.params["axis"], equation.params["reverse"]
         x = np.flip(inputs[0], axis) if backward else inputs[0]
-        rows = list(itertools.accumulate(np.moveaxis(x, axis, 0), lambda a, b: _elementwise(function, [a, b])))
-        result = np.moveaxis(np.stack(rows), 0, axis)
+        rows = itertools.accumulate(np.split(x, x.shape[axis], axis), lambda a, b: _elementwise(function, [a, b]))
+        result = np.concatenate(list(rows), axis)
         return [np.flip(result, axis) if backward else result]
 
     return accumulate

@@ -180,3 +180,17 @@ def test_conversions_and_rounding_on_symbols_are_those_of_jax():
     (symbols,), result = on_symbols(function, x=jnp.asarray(x))
     found = casadi.Function("f", [symbols], [result])(x.tolist()).full().ravel()
     np.testing.assert_array_equal(found, np.concatenate([np.asarray(y, float) for y in jax.jit(function)(x)]))
+
+
+def test_sums_along_a_vector_and_entries_beyond_it_are_those_of_jax():
+    from jaxdrones.optimal.interpreter import on_symbols
+    from jaxdrones.optimal.primitives import casadi
+
+    def function(x):
+        filled = jnp.take(x, np.array([1, 7]), mode="fill", fill_value=3.0)
+        return jnp.cumsum(x), jax.lax.cumprod(x, reverse=True), filled, x.at[np.array([0, 9])].get(mode="fill")
+
+    x = np.array([2.0, -1.0, 0.5, 4.0, 3.0])
+    (symbols,), result = on_symbols(function, x=jnp.asarray(x))
+    found = casadi.Function("f", [symbols], [result])(x.tolist()).full().ravel()
+    np.testing.assert_array_equal(found, np.concatenate(jax.jit(function)(x)))

@@ -17,11 +17,11 @@ from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene, render
 from jaxdrones.sensing.camera import OneCamera
+from jaxdrones.sensing.sensor import is_due
 from jaxdrones.state import State
 from jaxdrones.tasks.task import IMAGES, World
 
 _PIXELS = 16384  # computed at a time, to fit in a cache
-_ROUNDING = 1e-4  # of an image; tolerance for rounding of the times of images
 _PIXELS_OF_STARTS = 2048  # the same for starts of episodes, which are few in a step
 
 
@@ -65,8 +65,7 @@ class Vision:
     def is_due(self, step: Array) -> Array:
         """Whether a new image is observed after a control step."""
         exposed = step - self.delay
-        count, before = (jnp.floor((exposed - i) / self.every + _ROUNDING) for i in (0, 1))
-        return (count > before) & (exposed > 0)
+        return is_due(exposed, self.every) & (exposed > 0)
 
     def look(self, params: Params, drones: State, scene: Scene) -> dict[str, Array]:
         """Images of a state, without noise."""

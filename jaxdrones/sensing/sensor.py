@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
 
 _ARGUMENTS = {"measure": ("key", "params", "state", "rate", "scene", "memory"), "init": ("key", "params")}
+_LARGEST_DENOMINATOR, _INTEGERS = 1000, 2**31  # of a period in steps; range of the integers of steps
 _ROUNDING = 1e-4  # of a measurement; tolerance for rounding of a rate that divides the control rate
 
 
@@ -80,8 +82,17 @@ class Sensor:
         """
         if self.rate is None or self.rate * dt >= 1:
             return jnp.ones((), bool)
-        count, before = (jnp.floor((step - i) * (self.rate * dt) + _ROUNDING) for i in (0, 1))
-        return count > before
+        return is_due(step, 1 / (self.rate * dt))
+
+
+def is_due(step: jax.Array, period: float) -> jax.Array:
+    """Whether a step is the first one at or after a multiple of a period of at least one step.
+
+    The period, in steps, is taken for the nearest fraction with integers that fit, so that rounding never adds up.
+    """
+    most = max(1, min(_LARGEST_DENOMINATOR, int((_INTEGERS / period) ** 0.5)))
+    steps, times = Fraction(period).limit_denominator(most).as_integer_ratio()
+    return step % steps * times % steps < times
 
 
 def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[Sensor, ...]:

@@ -21,7 +21,7 @@ from jaxdrones.sensing import (
     range_finder,
     time_of_flight,
 )
-from jaxdrones.sensing.sensor import measure_sensors
+from jaxdrones.sensing.sensor import is_due, measure_sensors
 
 TEAM = jd.repeat(jd.load_params("cf2x"), 1)
 ROOM = Scene.of(  # walls at x = 2, x = -1, y = 1.5, y = -0.5 and a ceiling at z = 2.5
@@ -177,6 +177,17 @@ def test_a_measurement_is_due_in_the_first_step_that_is_late_enough(rate, expect
     """At 100 control steps per second."""
     clock = Sensor("clock", lambda key, params, state, rate, scene, memory: (None, 0.0), rate=rate)
     assert [k for k in range(13) if k == 0 or clock.is_due(k, 0.01)] == expected
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize(("rate", "control_hz"), [(125, 240), (70, 240), (70, 120), (333, 1000)])
+def test_a_measurement_is_due_after_hours_as_in_the_first_minute(rate, control_hz):
+    """The k-th one is in the first step at or after k / rate, up to two million steps."""
+    steps = np.append(np.arange(20_000), 2_000_000 + np.arange(20_000))
+    count, before = ((steps - i) * rate // control_hz for i in (0, 1))
+    clock = Sensor("clock", lambda key, params, state, rate, scene, memory: (None, 0.0), rate=float(rate))
+    np.testing.assert_array_equal(clock.is_due(jnp.asarray(steps), 1 / control_hz), count > before)
+    np.testing.assert_array_equal(is_due(jnp.asarray(steps), control_hz / rate), count > before)
 
 
 @pytest.mark.slow

@@ -135,7 +135,7 @@ class JaxMARLEnv:
     def _by_agent(self, obs: Any) -> dict[str, Any]:
         by_agent = self._layout.arrange(obs)
         if self._with_world_state:
-            vectors = obs["state"] if isinstance(obs, dict) else obs
+            vectors = jnp.stack([x["state"] if isinstance(x, dict) else x for x in by_agent.values()])
             by_agent[WORLD_STATE] = jnp.stack([jnp.roll(vectors, -i, axis=0).ravel() for i in range(self.num_agents)])
         return by_agent
 

@@ -45,7 +45,8 @@ class Layout:
             self.action = batch_space(action_of_drone(env), n)
 
     def arrange(self, tree: Any, axis: int = 0) -> Any:
-        """Convert arrays with drones along `axis` to this layout."""
+        """Convert arrays with drones along `axis` to this layout, real ones in single precision, as the spaces say."""
+        tree = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, tree)
         if self.names:
             return {name: _pick(tree, i, axis) for i, name in enumerate(self.names)}
         return _pick(tree, 0, axis) if self.drones == 1 else tree

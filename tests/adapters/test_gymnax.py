@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import assert_same_kind, mostly_slow
 
-from jaxdrones.adapters import gymnax
+from jaxdrones.adapters import gymnax, jaxmarl
 from jaxdrones.envs import TASKS, AutoReset, make
 
 pytestmark = pytest.mark.float32
@@ -23,6 +23,17 @@ def test_a_step_returns_what_it_was_given_as_loops_scan_over_it(task, env_of):
     shapes = {k: s.shape for k, s in space.spaces.items()} if isinstance(obs, dict) else space.shape
     assert jax.tree.map(jnp.shape, obs) == shapes
     assert action.shape == (env.num_actions,) == env.action_space(env.default_params).shape
+
+
+def test_observations_have_the_type_of_their_space_in_double_precision_too():
+    with jax.enable_x64(True):
+        plain = make("hover", drones=2, duration=0.02)
+        teams = jaxmarl.wrap(plain, world_state=True)
+        obs, _ = jax.eval_shape(gymnax.wrap(plain).reset, KEY)
+        of_agents, _ = jax.eval_shape(teams.reset, KEY)
+    assert plain.params.mass.dtype == jnp.float64
+    assert obs.dtype == gymnax.wrap(plain).observation_space().dtype == jnp.float32
+    assert {x.dtype for x in of_agents.values()} == {teams.observation_space("drone_0").dtype} == {jnp.dtype("float32")}
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,22 @@ def _name(function: Callable) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
+def call(where: str, function: Callable, params: Params, state: State, *others: Any) -> Any:
+    """Result of a user's function; a missing entry of `aux` is an error that says where, and how to give it."""
+    try:
+        return function(params, state, *others)
+    except KeyError as error:
+        missing = error.args[0] if error.args else ""
+        if missing in params.aux and missing in state.aux:
+            raise
+        constants, states = (", ".join(tree.aux) or "nothing" for tree in (params, state))
+        raise UserError(
+            f"{where} raises KeyError: {missing!r}; params.aux has {constants}, state.aux has {states}; give constants "
+            f"by params.replace(aux=params.aux | {{{missing!r}: ...}}), and states by "
+            f"models=(jaxdrones.Model({missing!r}, init, rate),) and step.init(params, state)"
+        ) from error
+
+
 def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | None = None) -> Wrench:
     """Validated wrench that a function of the argument `name` of `make_step` returned; `drones` of a team."""
     called = f"{name}: {describe([function])}"
@@ -69,7 +85,8 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
             counts &= x * x + y * y < neighbors.cutoff**2
         away = jnp.where(counts, 0, _OUT_OF_REACH)
         pos = jnp.stack([x + away for x in components(other_state.pos)])
-        wrench = check_wrench("pairs", pair, pair(own_params, own_state, other, other_state.replace(pos=pos)))
+        wrench = call(f"pairs: {describe([pair])}", pair, own_params, own_state, other, other_state.replace(pos=pos))
+        check_wrench("pairs", pair, wrench)
         parts = components(wrench.force) + components(wrench.torque)
         return [jnp.where(counts, x, 0) for x in parts]
 

@@ -256,3 +256,41 @@ def test_time_is_a_number(dt):
     ):
         with pytest.raises(ValueError, match=r"is .*; give a positive number"):
             control_step()
+
+
+def _cell(params, state, *_):
+    return jaxdrones.Wrench.of_force(params.aux["cell"] * state.pos)
+
+
+def _ones(params, *_):
+    return params.aux["cell"] * jnp.ones(4)
+
+
+ZERO = jaxdrones.Model("flap", lambda params: jnp.zeros(4), _ones)
+NEEDS_CONSTANT = {
+    "effects: _cell": dict(effects=(drag, _cell)),
+    "pairs: _cell": dict(pairs=(_cell,)),
+    "team_effects: _cell": dict(team_effects=(_cell,)),
+    "rotors: _ones": dict(rotors=_ones),
+    "rate of the model 'flap'": dict(models=(ZERO,)),
+    "init of the model 'flap'": dict(models=(jaxdrones.Model("flap", _ones, ZERO.rate),)),
+}
+
+
+@pytest.mark.parametrize("where", NEEDS_CONSTANT)
+def test_a_missing_constant_is_named_with_the_function_that_reads_it_and_the_remedy(where):
+    own = jaxdrones.make_step(**NEEDS_CONSTANT[where])
+    has = team.replace(aux={"tether": jnp.ones(2)})
+    with pytest.raises(jaxdrones.errors.UserError) as error:
+        own(has, own.init(has, start), rpm)
+    for part in f"{where} raises KeyError: 'cell'", "params.aux has tether", "params.aux | {'cell': ...}":
+        assert part in str(error.value)
+
+
+def test_a_key_error_of_a_function_with_its_entry_in_both_is_its_own():
+    def own(params, state):
+        raise KeyError("flap")
+
+    both = {"flap": jnp.ones((2, 4))}
+    with pytest.raises(KeyError, match="flap"):
+        jaxdrones.make_step((own,))(team.replace(aux=both), start.replace(aux=both), rpm)

@@ -1,11 +1,13 @@
 """Objects of users' Python files, named `file.py:name`."""
 
+import contextlib
 import functools
 import hashlib
 import inspect
 import sys
 import traceback
 import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +89,17 @@ def _said(error: BaseException) -> str:
     if isinstance(error, _OF_TRACING):
         return f"{kind}: {message}; JAX compiles this function: use jax.numpy, and jax.numpy.where in place of if"
     return f"{kind}: {message}{' ...' * bool(more)}" if message else kind
+
+
+@contextlib.contextmanager
+def errors_of(called: str, remedy: str) -> Iterator[None]:
+    """Context of a call of a user's function: an error becomes a `UserError` of one line with the remedy."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{called} raises {_said(error).rstrip('.')}; {remedy}") from error
 
 
 @functools.cache

@@ -254,6 +254,11 @@ def expand(x: Array, ndim: int) -> Array:
     return x.reshape(x.shape + (1,) * (ndim - x.ndim))
 
 
+def set_zero(where: Array, tree: Any) -> Any:
+    """Tree with zeros where the condition over its leading axes holds."""
+    return jax.tree.map(lambda x: jnp.where(expand(where, x.ndim), 0, x), tree)
+
+
 def _kernel_init(scale: float):
     return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
 

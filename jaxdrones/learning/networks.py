@@ -1,25 +1,22 @@
 """Policies: built-in and user-defined networks of normalized observations."""
 
-import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Protocol, Self, cast, runtime_checkable
+from typing import Any, Protocol, Self, cast, runtime_checkable
 
-import flax.errors
-import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked, function
-from jaxdrones.checks import is_concrete, short_repr
+from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
-from jaxdrones.learning.layers import MLP, OUTPUT_SCALE, Network, expand, make_network
+from jaxdrones.learning.layers import MLP, OUTPUT_SCALE, Network, make_network
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
+from jaxdrones.learning.own_network import OwnNetwork
 from jaxdrones.pytree import PyTreeNode
 
 
@@ -46,107 +43,6 @@ def initial_hidden_state(policy: AnyPolicy, drones: int) -> Any:
 def act(policy: AnyPolicy, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "n a"]]:
     """Hidden state after the observations, and actions."""
     return policy.act(hidden_state, obs) if isinstance(policy, RecurrentPolicy) else (hidden_state, policy(obs))
-
-
-class OwnNetwork:
-    """User-defined network: a flax linen, flax nnx or equinox module.
-
-    The network maps the normalized observation of one drone, (d,) or a dictionary with images, to one output per
-    action; the policy applies tanh to them. A recurrent network also has `initial_hidden_state()`, zeros of any
-    structure, and maps `(hidden_state, obs)` to `(hidden_state, output)`.
-
-    The parameters of a linen module are its variables. Those of an nnx or equinox module are a tuple of all its
-    floating-point arrays.
-    """
-
-    @checked
-    def __init__(self, module: Annotated[Any, function("a flax or equinox module", name="network")], output_size: int):
-        if isinstance(module, type):
-            raise UserError(f"network is the class {module.__name__}; give an object of this class")
-        self.module, self.output_size = module, output_size
-        self.recurrent = hasattr(module, "initial_hidden_state")
-        if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_concrete(x)):
-            raise UserError("network.initial_hidden_state() is not zero; give zeros")
-        if not isinstance(module, nn.Module):
-            self._leaves, self._structure = jax.tree.flatten(module)
-            if not any(map(_is_trained, self._leaves)):
-                raise UserError(f"network {short_repr(module)} has no parameters; give a flax or equinox module")
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, OwnNetwork) and self.module is other.module
-
-    def __hash__(self) -> int:
-        return id(self.module)
-
-    def init(self, key: jax.Array, example: Obs) -> Any:
-        """Initial parameters; only a linen module uses the key."""
-        if isinstance(self.module, nn.Module):
-            state = (self.module.initial_hidden_state(),) if self.recurrent else ()
-            return self.module.init(key, *state, example)
-        return tuple(jnp.asarray(x) for x in self._leaves if _is_trained(x))
-
-    def restored(self, params: Any, observation_size: int, per_agent: bool = False) -> Any:
-        """Parameters from a file, where tuples are dictionaries, possibly a set for each drone.
-
-        Raises:
-            ValueError: arrays of other shapes than those of the module; of a linen module of images, when it is called.
-        """
-        if isinstance(self.module, nn.Module):
-            try:
-                module = jax.eval_shape(lambda: self.init(jax.random.key(0), jnp.zeros(observation_size)))
-            except Exception:  # of the user's code, for images
-                return params
-        else:
-            module = tuple(filter(_is_trained, self._leaves))
-            params = tuple(params[str(i)] for i in range(len(params)))
-        own, found = _shapes(module), _shapes(params, per_agent)
-        for name in own | found:
-            if (here := own.get(name, "none")) != (there := found.get(name, "none")):
-                raise UserError(f"network has array {name} of shape {here}, the policy {there}; give its network")
-        return params
-
-    def with_params(self, params: Any) -> Callable:
-        """Module with other parameters; for linen a function that applies it."""
-        if isinstance(self.module, nn.Module):
-            return functools.partial(_apply, self.module, params)
-        rest = iter(params)
-        return jax.tree.unflatten(self._structure, [next(rest) if _is_trained(x) else x for x in self._leaves])
-
-    def apply(self, params: Any, obs: Obs, hidden_state: Any = None, starts: Array | None = None) -> tuple[Any, Array]:
-        """Hidden states and outputs of a batch, or with `starts` of sequences; see `layers.GRU` for the arguments."""
-        if starts is not None:
-
-            def step(state: Any, step_inputs: tuple[Obs, Array]) -> tuple[Any, tuple[Any, Array]]:
-                obs, start = step_inputs
-                state, output = self.apply(params, obs, set_zero(start, state))
-                return state, (state, output)
-
-            return jax.lax.scan(step, hidden_state, (obs, starts))[1]
-
-        def one_drone(state: Any, obs: Obs) -> tuple[Any, Array]:
-            module = self.with_params(params)
-            return module(state, obs) if self.recurrent else (None, module(obs))
-
-        for _ in range(state_vector(obs).ndim - 1):
-            one_drone = jax.vmap(one_drone)
-        return one_drone(hidden_state, obs)
-
-
-def _shapes(tree: Any, per_agent: bool = False) -> dict[str, tuple[int, ...]]:
-    named = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path): np.shape(x)[int(per_agent) :] for path, x in named}
-
-
-def _apply(module: nn.Module, params: Any, *args: Any) -> Any:
-    """Output of a linen module with parameters that may be those of another one."""
-    try:
-        return module.apply(params, *args)
-    except (flax.errors.ScopeParamNotFoundError, flax.errors.ScopeParamShapeError) as error:
-        raise UserError(f"the policy's parameters are not those of network: {error}; give its network") from error
-
-
-def _is_trained(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 class Policy(PyTreeNode):
@@ -293,8 +189,3 @@ def apply(
     state_axis = axis if starts is None else axis - 1
     in_axes, out_axes = (0, axis, state_axis), (axis, axis)
     return jax.vmap(of_network, in_axes=in_axes, out_axes=out_axes)(params, x, hidden_state)
-
-
-def set_zero(where: Array, tree: Any) -> Any:
-    """Tree with zeros where the condition over its leading axes holds."""
-    return jax.tree.map(lambda x: jnp.where(expand(where, x.ndim), 0, x), tree)

@@ -108,6 +108,28 @@ class Started(Remember):
         return jnp.ones(1)
 
 
+class Forgetful(Remember):
+    def __call__(self, state, obs):
+        return super().__call__(state, obs)[1]
+
+
+class Dropped(nnx.Linear):
+    def __init__(self, size, outputs, rngs):
+        super().__init__(size, outputs, rngs=rngs)
+        self.dropout = nnx.Dropout(0.5, rngs=rngs)
+
+    def __call__(self, obs):
+        return super().__call__(self.dropout(obs))
+
+
+def test_a_network_with_disabled_dropout_is_that_without_it():
+    network = Dropped(2, 1, nnx.Rngs(0))
+    network.eval()
+    obs = jnp.array([[0.5, -0.2]])
+    action = Policy.init(KEY, DoubleIntegrator(), network=network)(obs)
+    np.testing.assert_allclose(action, jnp.tanh(nnx.Linear(2, 1, rngs=nnx.Rngs(0))(obs)), rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     "network, error",
     [
@@ -116,6 +138,9 @@ class Started(Remember):
         (Started(), "is not zero"),
         (Started, "network is the class Started; give an object"),
         (lambda obs: obs[:1], "network <function .* has no parameters; give a flax or equinox module"),
+        (nnx.Linear(3, 1, rngs=nnx.Rngs(0)), r"network Linear raises TypeError: .*observation of .*shape \(2,\)"),
+        (Dropped(2, 1, rngs=nnx.Rngs(0)), "network Dropped changes its arrays in a call, as dropout"),
+        (Forgetful(), r"network Forgetful has a hidden state and returns .*; return \(hidden_state, output\)"),
     ],
 )
 def test_a_network_that_does_not_fit_is_refused(network, error):

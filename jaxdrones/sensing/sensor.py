@@ -55,7 +55,8 @@ class Sensor:
     bound: float = np.inf
     """Largest absolute value of a reading, in its units."""
     rate: float | None = None
-    """Measurements per second; the reading is held in between. The default is one every control step."""
+    """Measurements per second, at most the control rate; the reading is held in between. The default is one every
+    control step."""
     entries: tuple[Quantity, ...] = ()
     """Description of each entry of the flattened reading, for `jaxdrones.explain`; optional."""
     clocked: bool = False
@@ -115,6 +116,11 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
             raise UserError(
                 f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz, which does not divide the {1 / dt:g} Hz of "
                 "the control steps; give it a rate that does, or another control_hz"
+            )
+        if sensor.rate and sensor.rate * dt > 1 + _ROUNDING:
+            raise UserError(
+                f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz; give at most the control rate, {1 / dt:g} Hz, "
+                "or rate=None for a measurement in every control step"
             )
     return sensors
 

@@ -45,6 +45,18 @@ def battery():
     )
 
 
+@pytest.mark.parametrize("rate", [101.0, 1000.0])
+def test_a_rate_above_the_control_rate_is_refused(rate):
+    fast = dataclasses.replace(NOISY, rate=rate)
+    with pytest.raises(ValueError, match=rf"'noisy' measures at {rate:g} Hz; give at most the control rate, 100 Hz"):
+        make("hover", sensors=(fast,))
+
+
+@pytest.mark.parametrize("rate", [None, 100.0, 100 * (1 + 1e-7)])
+def test_a_sensor_may_measure_in_every_control_step(rate):
+    assert make("hover", sensors=(dataclasses.replace(NOISY, rate=rate),)).sensors[0].rate == rate
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_an_environment_with_sensors_and_models_keeps_the_contract(backend):

@@ -204,6 +204,13 @@ def bind(function: Callable, **values: Any) -> Callable:
     return functools.partial(function, **bound) if bound else function
 
 
+def depends_on(function: Callable, value: Any) -> bool:
+    """Whether the traced program of a function of one array uses it."""
+    program = jax.make_jaxpr(function)(value).jaxpr
+    used = {id(x) for equation in program.eqns for x in equation.invars} | set(map(id, program.outvars))
+    return any(id(x) in used for x in program.invars)
+
+
 def check_arrays(**trees: Any) -> None:
     """Raise unless every field but `aux` of these objects by name is an array or a number.
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function, number
-from jaxdrones.checks import check_function, check_number, check_shape
+from jaxdrones.checks import check_function, check_number, check_shape, depends_on
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -35,10 +35,12 @@ def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag
     Args:
         field: `(pos) -> wind` or `(pos, time) -> wind` for one drone, (3,) m/s, world; the latter needs the model
             `clock()` in the step.
-        effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`.
+        effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`,
+            `flapping_moment`, or your own.
 
     Raises:
-        ValueError: an argument of another type; in flight, a field of time without a clock, or a wind of another shape.
+        ValueError: an argument of another type; in flight, a field of time without a clock, a wind of another shape, or
+            an effect that does not depend on `params.wind`.
     """
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_function("field", field, arguments, example="jaxdrones.logarithmic_wind(5.0)")
@@ -51,6 +53,12 @@ def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag
             )
         wind = field(state.pos, state.aux["clock"]) if len(arguments) == 2 else field(state.pos)
         check_shape("wind", wind, (3,), "m/s, world, as the field returns it")
+        if not depends_on(lambda wind: effect(params.replace(wind=wind), state, **scene), params.wind):
+            name = getattr(effect, "__name__", repr(effect))
+            raise UserError(
+                f"in_wind: {name} does not depend on params.wind, so the field has no influence; give an effect that "
+                "does, for example jaxdrones.drag"
+            )
         return effect(params.replace(wind=params.wind + wind), state, **scene)
 
     return blown

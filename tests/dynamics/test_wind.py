@@ -133,6 +133,18 @@ def test_mistakes_are_named():
         jd.quadratic_drag(CF2X.replace(aux={}), HOVER)
 
 
+def test_an_effect_that_the_wind_cannot_change_is_refused_in_a_wind_field():
+    def gusty(params, state):
+        return jd.Wrench.of_force(params.wind)
+
+    for effect in EFFECTS.values():
+        jd.in_wind(lambda pos: pos, jax.jit(effect))(CF2X, HOVER)
+    np.testing.assert_allclose(jd.in_wind(lambda pos: pos, gusty)(CF2X, HOVER).force, [0, 0, 1])
+    blown = jd.make_step((jd.in_wind(lambda pos: pos, jd.external_force),))
+    with pytest.raises(ValueError, match=r"in_wind: external_force does not depend on params\.wind"):
+        blown(jd.repeat(CF2X, 1), jd.State.at_rest([[0.0, 0, 1]]), jnp.zeros((1, 4)))
+
+
 def test_rotors_never_pull_down_and_a_descent_at_most_doubles_their_thrust():
     """All vehicles, from standing rotors to the fastest, at up to 100 m/s in all directions; with finite gradients."""
     team = jax.tree.map(lambda *x: jnp.stack(x), *(jd.load_params(name) for name in sorted(jd.assets.vehicles())))

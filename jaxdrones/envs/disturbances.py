@@ -10,11 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, number
+from jaxdrones.engine.physics import Loads, Physics
 from jaxdrones.envs.randomize import Randomization
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
 
 _FOOT = 0.3048  # m
 _LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, range of the specification's low-altitude model
@@ -64,6 +68,31 @@ class DisturbanceWithMemory:
     def starting(self) -> Randomization:
         """`start` as a randomization."""
         return described(f"start of: {self.text}", functools.partial(self.start))
+
+
+def check_wind(physics: Physics, params: Params, scene: Scene, drawn: Params, disturbance: Disturbance | None) -> None:
+    """Raise for a random wind on which no effect, rotor or model of the physics depends.
+
+    `params` are those of a team, `scene` may have shapes in place of arrays, and `drawn` is a mask of the parameters
+    that are random in every episode.
+    """
+
+    def wind(key: jax.Array) -> Array:
+        return disturbance(key, params, 0.01).wind if disturbance else params.wind
+
+    if not (drawn.wind or compiler.depends(wind, jax.random.key(0))):
+        return
+    zeros = jnp.zeros_like(params.wind, shape=(len(params.mass), 4))
+    state = physics.init(params, State.at_rest(jnp.zeros_like(params.wind)))
+
+    def loads(wind: Array, scene: Scene) -> Loads:
+        return physics.loads(params.replace(wind=wind), state, zeros, physics.seen(scene))
+
+    if not any(jax.tree.leaves(compiler.depends(loads, params.wind, scene))):
+        raise UserError(
+            "there is a random wind, and no effect depends on it; give an effect that does, for example "
+            "effects=('drag',), or leave out the wind"
+        )
 
 
 @checked

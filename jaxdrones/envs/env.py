@@ -15,7 +15,7 @@ from jaxdrones.checks import check_shape, check_whole, is_concrete
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
-from jaxdrones.envs.disturbances import Disturbance, DisturbanceWithMemory
+from jaxdrones.envs.disturbances import Disturbance, DisturbanceWithMemory, check_wind
 from jaxdrones.envs.functions import DrawScene, check_episode, check_process, scene_example
 from jaxdrones.envs.observations import PrivilegedObservation, bounds, deviations, observe
 from jaxdrones.envs.randomize import Noise, Randomization
@@ -158,7 +158,10 @@ class Env:
         """Length of every observation term of a drone."""
         first_world = functools.partial(episode.first_world, self)
         drawn, on_the_way = (self.draws, self.scene), (self.noise, self.disturbance)
-        return check_episode(self.task, self.params, *drawn, self.terms, self.dt, first_world, *on_the_way)
+        sizes = check_episode(self.task, self.params, *drawn, self.terms, self.dt, first_world, *on_the_way)
+        random = jax.tree.unflatten(jax.tree.structure(self.params), self._drawn)
+        check_wind(self.physics.physics, self.params, scene_example(self.scene), random, self.disturbance)
+        return sizes
 
     @functools.cached_property
     def observation_bound(self) -> np.ndarray:

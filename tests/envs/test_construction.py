@@ -12,6 +12,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones.envs import make
+from jaxdrones.envs.disturbances import random_pushes
 
 PICKLE = """
 import sys
@@ -43,7 +44,7 @@ def test_an_environment_is_immutable():
 
 @pytest.mark.slow
 def test_replacing_a_field_keeps_what_is_drawn():
-    env = make("hover", delay=(0.0, 0.04), disturbance=jd.dryden(7.7))
+    env = make("hover", effects=("drag",), delay=(0.0, 0.04), disturbance=jd.dryden(7.7))
     other = dataclasses.replace(env, steps=3)
     assert len(other.draws) == len(env.draws) == 2
     for a, b in zip(*(jax.tree.leaves(e.reset(jax.random.key(1))) for e in (env, other)), strict=True):
@@ -61,7 +62,7 @@ def test_replacing_a_field_keeps_what_is_drawn():
 )
 def test_what_a_task_or_a_disturbance_brings_acts_once_where_it_is_given_too(task, kind, given):
     contact = tuple(f for f in (jd.ground_contact, jd.drone_contact) if f.needs.contact in make(task).task.contact)
-    physics = make(task, disturbance=jd.dryden(7.7), **{kind: given}).physics.physics
+    physics = make(task, disturbance=random_pushes(0.3), **{kind: given}).physics.physics
     functions = [f.func if isinstance(f, functools.partial) else f for f in (*physics.effects, *physics.pairs)]
     for brought in (*contact, jd.external_force):
         assert functions.count(brought) == 1

@@ -187,13 +187,13 @@ def test_mistakes_are_named():
 @pytest.mark.slow
 def test_a_privileged_observation_has_no_noise_and_shows_the_drawn_parameters():
     randomize = (scaled("mass", 0.9, 1.1), constant_wind(2.0))
-    env = make("hover", randomize=randomize, noise=sensor_noise())
+    env = make("hover", effects=("drag",), randomize=randomize, noise=sensor_noise())
     obs, world = env.reset(KEY)
     known = env.privileged_observation(world)
     assert known.params.shape == (1, env.privileged_size) == (1, 4)
     np.testing.assert_allclose(known.params[0, 0], world.params.mass[0] / env.params.mass[0] - 1, rtol=1e-12)
     np.testing.assert_array_equal(known.params[0, 1:], world.params.wind[0])
-    plain = make("hover", randomize=randomize)
+    plain = make("hover", effects=("drag",), randomize=randomize)
     np.testing.assert_allclose(known.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
     assert np.abs(obs - known.obs).max() > 1e-4
     assert plain.reset(KEY)[0].shape == known.obs.shape and make("hover").privileged_size == 0
@@ -219,7 +219,7 @@ def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn)
     leaves = jax.tree_util.tree_leaves_with_path(TEAM)
     found = zip(leaves, drawn_leaves([randomize], TEAM), strict=True)
     assert [jax.tree_util.keystr(path, simple=True) for (path, _), is_drawn in found if is_drawn] == drawn
-    env = make("hover", randomize=(randomize,))
+    env = make("hover", effects=("drag",), randomize=(randomize,))
     assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)
 
 

@@ -11,7 +11,9 @@ from helpers import assert_finite, assert_same_kind, jit_unoptimized, mostly_slo
 
 import jaxdrones as jd
 from jaxdrones.envs import make
-from jaxdrones.envs.disturbances import scales
+from jaxdrones.envs.disturbances import random_pushes, scales
+from jaxdrones.envs.randomize import constant_wind, scaled
+from jaxdrones.sensing import Scene, Sphere
 
 KEY = jax.random.key(0)
 AXES = "uvw"
@@ -137,6 +139,41 @@ def test_an_environment_flies_in_turbulence_that_starts_anew():
     assert np.all(other["u"] != world.params.aux["dryden"]["u"])
     assert env.privileged_observation(after).params.shape == (2, env.privileged_size)
     assert "Dryden turbulence of 7.7 m/s" in jd.explain(env).physics["disturbance"]
+
+
+def own_wind(key, params):
+    return params.replace(wind=jax.random.normal(key, (3,), params.wind.dtype))
+
+
+def own_gusts(key, params, dt):
+    return params.replace(wind=jax.random.normal(key, params.wind.shape, params.wind.dtype))
+
+
+WINDS = {
+    "turbulence": dict(disturbance=jd.dryden(7.7)),
+    "constant": dict(randomize=(constant_wind(3.0),)),
+    "own randomization": dict(randomize=(own_wind,)),
+    "own disturbance": dict(disturbance=own_gusts),
+}
+
+
+@pytest.mark.parametrize("name", WINDS)
+def test_a_random_wind_without_an_effect_of_it_is_refused(name):
+    with pytest.raises(ValueError, match="there is a random wind, and no effect depends on it; give an effect"):
+        make("hover", effects=("ground_effect",), **WINDS[name])
+
+
+def gusty_rotors(params, state, command):
+    return command + params.wind[0], 0 * command
+
+
+@pytest.mark.parametrize("by", [dict(effects=(jax.jit(jd.inflow_thrust),)), dict(rotors=gusty_rotors)])
+def test_a_random_wind_may_act_on_an_own_effect_or_on_rotors(by):
+    make("hover", scene=lambda key: Scene.of(Sphere(pos=(3.0, 0, 1), radius=0.1)), **by, **WINDS["constant"])
+
+
+def test_a_random_push_needs_no_effect_of_wind():
+    make("hover", disturbance=random_pushes(0.3), randomize=(scaled("mass", 0.9, 1.1),))
 
 
 def test_mistakes_are_named():

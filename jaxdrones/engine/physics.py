@@ -17,7 +17,16 @@ from jaxdrones.dynamics.needs import layers, needs_of
 from jaxdrones.dynamics.propulsion import pwm_rotors
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, call, check_wrench, describe, from_others, side_by_side
+from jaxdrones.engine.wrenches import (
+    Effect,
+    Pair,
+    TeamEffect,
+    check_wrench,
+    describe,
+    explained_key_errors,
+    from_others,
+    side_by_side,
+)
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -151,8 +160,8 @@ class Physics:
 
     def init(self, params: Params, state: State) -> State:
         """State of a team, with missing model states initialized."""
-        missing = [model for model in self.models if model.name not in state.aux]
-        fresh = {m.name: call(f"init of the model {m.name!r}", m.start, params, state) for m in missing}
+        with explained_key_errors(params, state):
+            fresh = {model.name: model.start(params, state) for model in self.models if model.name not in state.aux}
         return state.replace(aux=state.aux | fresh)
 
     def loads(
@@ -164,12 +173,11 @@ class Physics:
         contact: Contact | None = None,
     ) -> Loads:
         """Rotor speeds, wrenches and rates of a team; arguments are those of `wrench` and the commanded speeds."""
-        rpm, rpm_rate = self.rotor_speed(params, state, command)
-        state = state.replace(rpm=rpm)
-        aux_rate = {
-            m.name: call(f"rate of the model {m.name!r}", m.team_rate, params, state, command) for m in self.models
-        }
-        wrench = self.wrench(params, state, scene, contact) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
+        with explained_key_errors(params, state):
+            rpm, rpm_rate = self.rotor_speed(params, state, command)
+            state = state.replace(rpm=rpm)
+            aux_rate = {model.name: model.team_rate(params, state, command) for model in self.models}
+            wrench = self.wrench(params, state, scene, contact) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
         return Loads(state, wrench, rpm_rate, aux_rate)
 
     def rotor_speed(
@@ -181,9 +189,8 @@ class Physics:
                 raise UserError(
                     f"state.aux lacks {model.name!r}, the state of a model; start from step.init(params, state)"
                 )
-        speeds = jax.vmap(functools.partial(call, f"rotors: {describe([self.rotors])}", self.rotors))(
-            params, state, command
-        )
+        with explained_key_errors(params, state):
+            speeds = jax.vmap(self.rotors)(params, state, command)
         if jax.tree.map(np.shape, speeds) != (command.shape, command.shape):
             returned = jax.tree.map(lambda x: np.shape(x)[1:], speeds)
             raise UserError(
@@ -205,11 +212,8 @@ class Physics:
         contacts = self.contacts("obstacles")
         effects = [effect for effect in self.effects if effect not in contacts]
 
-        def evaluated(name: str, f: Callable, bound: Callable, params: Params, state: State, *drones: int) -> Wrench:
-            return check_wrench(name, f, call(f"{name}: {describe([f])}", bound, params, state), *drones)
-
         def alone(params: Params, state: State) -> Wrench:
-            own = (evaluated("effects", f, bind(f, scene=scene), params, state) for f in effects)
+            own = (check_wrench("effects", f, bind(f, scene=scene)(params, state)) for f in effects)
             return sum(own, rotor_wrench(params, state))
 
         wrench = jax.vmap(alone)(params, state)
@@ -217,7 +221,7 @@ class Physics:
             wrench += contact(params, state)
         elif scene.has_obstacles:
             wrench = sum((jax.vmap(bind(f, scene=scene))(params, state) for f in contacts), wrench)
-        of_team = (evaluated("team_effects", f, f, params, state, len(state.pos)) for f in self.team_effects)
+        of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
         wrench = sum(of_team, wrench)
         state = side_by_side(state) if self.contacts("drones") else state
         return sum((from_others(pair, params, state, self.neighbors) for pair in self.pairs), wrench)

@@ -1,8 +1,11 @@
 """Wrenches between drones, and validation of functions that compute wrenches."""
 
+import contextlib
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -41,18 +44,21 @@ def _name(function: Callable) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def call(where: str, function: Callable, params: Params, state: State, *others: Any) -> Any:
-    """Result of a user's function; a missing entry of `aux` is an error that says where, and how to give it."""
+@contextlib.contextmanager
+def explained_key_errors(params: Params, state: State) -> Iterator[None]:
+    """Turn the KeyError of a user's function that misses an entry of `aux` into one with its place and the remedy."""
     try:
-        return function(params, state, *others)
+        yield
     except KeyError as error:
         missing = error.args[0] if error.args else ""
         if missing in params.aux and missing in state.aux:
             raise
+        last = traceback.extract_tb(error.__traceback__)[-1]
         constants, states = (", ".join(tree.aux) or "nothing" for tree in (params, state))
         raise UserError(
-            f"{where} raises KeyError: {missing!r}; params.aux has {constants}, state.aux has {states}; give constants "
-            f"by params.replace(aux=params.aux | {{{missing!r}: ...}}), and states by "
+            f"{last.name} ({Path(last.filename).name}, line {last.lineno}) raises KeyError: {missing!r}; params.aux "
+            f"has {constants}, state.aux has {states}; give constants by "
+            f"params.replace(aux=params.aux | {{{missing!r}: ...}}), and states by "
             f"models=(jaxdrones.Model({missing!r}, init, rate),) and step.init(params, state)"
         ) from error
 
@@ -85,8 +91,7 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
             counts &= x * x + y * y < neighbors.cutoff**2
         away = jnp.where(counts, 0, _OUT_OF_REACH)
         pos = jnp.stack([x + away for x in components(other_state.pos)])
-        wrench = call(f"pairs: {describe([pair])}", pair, own_params, own_state, other, other_state.replace(pos=pos))
-        check_wrench("pairs", pair, wrench)
+        wrench = check_wrench("pairs", pair, pair(own_params, own_state, other, other_state.replace(pos=pos)))
         parts = components(wrench.force) + components(wrench.torque)
         return [jnp.where(counts, x, 0) for x in parts]
 

@@ -268,22 +268,25 @@ def _ones(params, *_):
 
 ZERO = jaxdrones.Model("flap", lambda params: jnp.zeros(4), _ones)
 NEEDS_CONSTANT = {
-    "effects: _cell": dict(effects=(drag, _cell)),
-    "pairs: _cell": dict(pairs=(_cell,)),
-    "team_effects: _cell": dict(team_effects=(_cell,)),
-    "rotors: _ones": dict(rotors=_ones),
-    "rate of the model 'flap'": dict(models=(ZERO,)),
-    "init of the model 'flap'": dict(models=(jaxdrones.Model("flap", _ones, ZERO.rate),)),
+    "effect": ("_cell", dict(effects=(drag, _cell))),
+    "pair": ("_cell", dict(pairs=(_cell,))),
+    "team effect": ("_cell", dict(team_effects=(_cell,))),
+    "rotors": ("_ones", dict(rotors=_ones)),
+    "rate": ("_ones", dict(models=(ZERO,))),
+    "init": ("_ones", dict(models=(jaxdrones.Model("flap", _ones, ZERO.rate),))),
 }
 
 
 @pytest.mark.parametrize("where", NEEDS_CONSTANT)
 def test_a_missing_constant_is_named_with_the_function_that_reads_it_and_the_remedy(where):
-    own = jaxdrones.make_step(**NEEDS_CONSTANT[where])
+    name, options = NEEDS_CONSTANT[where]
+    own = jaxdrones.make_step(**options)
     has = team.replace(aux={"tether": jnp.ones(2)})
+    line = {"_cell": _cell, "_ones": _ones}[name].__code__.co_firstlineno + 1
     with pytest.raises(jaxdrones.errors.UserError) as error:
         own(has, own.init(has, start), rpm)
-    for part in f"{where} raises KeyError: 'cell'", "params.aux has tether", "params.aux | {'cell': ...}":
+    assert str(error.value).startswith(f"{name} (test_bad_input.py, line {line}) raises KeyError: 'cell'")
+    for part in "params.aux has tether", "params.aux | {'cell': ...}":
         assert part in str(error.value)
 
 

@@ -29,7 +29,7 @@ Ipopt uses the Gauss-Newton Hessian; fatrop uses the exact one, and the structur
 """
 
 _LARGEST = 1e3  # m, m/s; solvers may never return from larger errors, or from more than half a turn in an interval
-_INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed
+_INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed if there is one
 
 
 class Mpc:
@@ -116,7 +116,8 @@ class Mpc:
         self._solver = casadi.nlpsol("mpc", solver, program, options)
         limit = float(model.params.max_rpm) / self._unit
         # Solvers relax bounds a little, and beyond the motor limits the model is independent of the commands.
-        free, bounded = np.full(n, np.inf), [np.full(4, _INSIDE * limit), np.full(4, (1 - _INSIDE) * limit)]
+        margin = _INSIDE * (limit if np.isfinite(limit) else 1)
+        free, bounded = np.full(n, np.inf), [np.full(4, margin), np.full(4, limit - margin)]
         self._low = np.concatenate([*[-free, bounded[0]] * self.horizon, -free])
         self._high = np.concatenate([*[free, bounded[1]] * self.horizon, free])
 

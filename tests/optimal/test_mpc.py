@@ -44,6 +44,18 @@ def test_at_the_target_the_plan_is_hover_and_far_off_it_keeps_to_the_limits():
 
 
 @pytest.mark.slow
+def test_motors_without_a_limit_are_commanded():
+    from jaxdrones.optimal.mpc import Mpc
+    from jaxdrones.optimal.twin import casadi_model
+
+    team = team_of("cf2x")
+    mpc = Mpc(casadi_model(one(team).replace(max_rpm=jnp.asarray(jnp.inf))), DT, horizon=2)
+    above = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.5]), (3, 3)))
+    rpm = mpc(one(hovering(team)), above)
+    assert mpc.status == Status.OK and np.all(np.isfinite(rpm)) and np.all(rpm > team.hover_rpm)
+
+
+@pytest.mark.slow
 def test_constants_that_are_symbols_are_given_at_each_call():
     """A heavier drone hovers at its own speed, though the model was made for the light one."""
     mpc, team = controller(horizon=4, parameters=("mass",)), team_of("cf2x")

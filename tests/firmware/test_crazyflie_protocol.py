@@ -4,15 +4,17 @@ import dataclasses
 import math
 import struct
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from jaxdrones.control import firmware_pid
 from jaxdrones.firmware.crazyflie.commander import LEVEL_AFTER, OFF_AFTER, Commander, decompress
+from jaxdrones.firmware.crazyflie.firmware import Crazyflie
 from jaxdrones.firmware.crazyflie.high_level import HighLevel
 from jaxdrones.firmware.crazyflie.log import TOC, Log
-from jaxdrones.firmware.crazyflie.packet import E2BIG, EEXIST, ENOENT, MAX_DATA, Packet, decode, encode
+from jaxdrones.firmware.crazyflie.packet import E2BIG, EEXIST, ENOENT, MAX_DATA, Packet, Port, decode, encode
 from jaxdrones.firmware.crazyflie.parameters import GAINS, Parameters
 from jaxdrones.firmware.crazyflie.planner import Goal, go_to
 from jaxdrones.firmware.crazyflie.supervisor import Supervisor
@@ -348,3 +350,19 @@ def test_the_vehicle_tumbles_locks_and_recovers():
     assert supervisor.can_fly
     supervisor.watch(level, 3.1, 0.01)  # the watchdog was not repeated
     assert supervisor.locked and not supervisor.can_fly
+
+
+def test_what_is_written_to_the_memory_is_read_up_to_the_size_of_a_packet():
+    """Older versions of cflib write 25 bytes at once, which fill a packet; an answer has room for 24."""
+    vehicle: Any = SimpleNamespace(gains=firmware_pid.gains(), sample=SAMPLE)
+    crazyflie, content = Crazyflie(vehicle), bytes(range(25))
+
+    def ask(channel, address, data):
+        *_, answer = crazyflie.answer(
+            Packet(Port.MEMORY, channel, struct.pack("<BI", 0, address) + data), "client", 0.0
+        )
+        return answer.data[5:]
+
+    assert ask(2, 7, content) == b"\0"
+    assert ask(1, 7, b"\x18") == b"\0" + content[:24] and ask(1, 31, b"\1") == b"\0" + content[24:]
+    assert ask(1, 7, b"\x19") == ask(2, 4090, content) == bytes([ENOENT])

@@ -142,7 +142,8 @@ class Crazyflie:
             return None
         number, address = struct.unpack("<BI", data[:5])
         size = data[5] if channel == 1 and len(data) == 6 else len(data) - 5
-        if number != 0 or address + size > MEMORY_BYTES or size > _MOST_READ or channel not in (1, 2):
+        most = {1: _MOST_READ, 2: MEMORY_BYTES}.get(channel, -1)  # a write is as long as its packet
+        if number != 0 or address + size > MEMORY_BYTES or size > most:
             return data[:5] + bytes([ENOENT])
         memory = self.high_level.memory
         if channel == 1:

@@ -15,7 +15,7 @@ from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.dynamics.model import PointMass
 from jaxdrones.errors import UserError
-from jaxdrones.optimal.coordinates import command_unit, of_point_masses, small_turn
+from jaxdrones.optimal.coordinates import command_unit, of_point_masses
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -99,7 +99,8 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     a drone at the origin; point masses, such as loads, follow the setpoints.
     """
     quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
-    omega = _with_last(jax.vmap(small_turn)(quat[:-1], quat[1:]) / dt)
+    turns = jax.vmap(rotation.multiply)(jax.vmap(rotation.conjugate)(quat[:-1]), quat[1:])
+    omega = _with_last(jax.vmap(rotation.log)(turns) / dt)
     omega_rate = _with_last(jnp.diff(omega[:-1], axis=0) / dt, 2)
     rpm = jax.vmap(lambda f, w, a: rpm_from_wrench(params, f, params.inertia * a + cross(w, params.inertia * w)))(
         thrust, omega, omega_rate

@@ -181,6 +181,13 @@ def test_a_planner_moves_its_plan_on_by_a_step_or_drops_it_and_holds_its_command
         assert not np.array_equal(jax.random.key_data(after.key), jax.random.key_data(memory.key))
 
 
+def test_a_reference_turns_as_fast_as_its_heading_also_by_a_radian_in_a_step():
+    params, dt, rate = jd.load_params("cf2x"), 0.1, -10.0  # s, rad/s
+    setpoints = Setpoint.at(jnp.zeros((6, 3)), yaw=3 + rate * dt * jnp.arange(6))
+    omega = jit_unoptimized(lambda: optimal.reference(params, setpoints, {}, dt).state.omega)()
+    np.testing.assert_allclose(omega, np.tile([0, 0, rate], (6, 1)), atol=1e-12)
+
+
 def test_the_rotor_speeds_of_a_reference_obey_eulers_equation():
     """Torque = I dw/dt + w x I w, for a drone that turns about its yaw axis and tilts on a circle."""
     params = jd.load_params("hb")

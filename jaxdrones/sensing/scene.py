@@ -63,7 +63,7 @@ class Scene(PyTreeNode, kw_only=True):
             ground: whether there is a ground plane at z = 0.
 
         Raises:
-            ValueError: an argument that is not an obstacle, or one of a wrong shape or size.
+            ValueError: an argument that is not an obstacle, one of a wrong shape or size, or several classes of a kind.
         """
         for obstacle in obstacles:
             if not isinstance(obstacle, (*KINDS.values(), File)):
@@ -74,6 +74,9 @@ class Scene(PyTreeNode, kw_only=True):
         arrays: dict[str, Any] = {}
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
+            if len(classes := dict.fromkeys(map(type, rows))) > 1:
+                given = " and ".join(own.__name__ for own in classes)
+                raise UserError(f"the {name} are of the classes {given}; give {kind.__name__} for all of them")
             if sum(len(row.pos) for row in rows):  # an empty array is ignored
                 arrays[name] = _joined(rows)
         meshes = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Mesh))

@@ -38,6 +38,18 @@ def test_a_gate_leaves_its_opening_free_and_closes_the_rest():
     assert not blocked(0.37, 0)
 
 
+class Door(Box):
+    """A class of a user."""
+
+
+def test_obstacles_of_a_kind_have_one_class_which_may_be_that_of_a_user():
+    door, box = (kind(pos=(1.0, 0, 1), size=(0.1, 1.0, 2.0)) for kind in (Door, Box))
+    beside = (0.0, -0.4, 1.0)  # nearer to the door than to the ball
+    np.testing.assert_allclose(Scene.of(door, door, BALL).distance(beside), Scene.of(box).distance(beside), rtol=1e-12)
+    with pytest.raises(ValueError, match="the boxes are of the classes Door and Box; give Box for all of them"):
+        Scene.of(door, BALL, box)
+
+
 @pytest.mark.slow
 def test_inside_is_inside_whatever_way_an_obstacle_is_turned():
     box = Scene.of(Box(pos=(0, 0, 1), quat=QUARTER_TURN, size=(2.0, 0.2, 0.2)))

@@ -25,6 +25,7 @@ POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_
 """Constants of a vehicle that must be positive."""
 NOT_NEGATIVE = ("km", "gravity", "air_density", "collision_radius", "collision_height")
 """Constants that must not be negative."""
+_LARGEST_THRUST = 100.0  # over the weight
 _MAY_BE_INFINITE = ("max_rpm",)
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 _NO_ARRAYS = (list, tuple, dict, str, type(None))
@@ -236,6 +237,22 @@ def check_params(params: Any, finite: bool = True) -> None:
             leaf = constants[name]
             if is_concrete(leaf) and not (np.asarray(leaf) > bound).all():
                 raise UserError(f"params.{name} is {short_repr(leaf)}; give {words}")
+
+
+def check_vehicle(params: Any) -> None:
+    """Raise for concrete constants of a team that are not finite, or with which it cannot hover."""
+    check_finite("vehicle", params)
+    if not all(map(is_concrete, (params.mass, params.gravity, params.kf, params.max_rpm))):
+        return
+    weight, thrust = np.asarray(params.weight, float), np.asarray(params.max_thrust, float)
+    wrong = (weight > 0) & ~((weight < thrust) & (thrust <= _LARGEST_THRUST * weight))
+    if wrong.any():
+        ratio, hover, fastest = (np.asarray(x)[wrong][0] for x in (thrust / weight, params.hover_rpm, params.max_rpm))
+        raise UserError(
+            f"vehicle hovers at {hover:.4g} RPM of at most {fastest:.4g}, with a highest thrust of {ratio:.4g} times "
+            f"its weight; give a ratio above 1 and up to {_LARGEST_THRUST:g}, mass in kg, max_rpm in RPM, and kf in "
+            "N/RPM^2, which is 0.010966 times that in N/(rad/s)^2"
+        )
 
 
 def _without_infinity(leaf: Any) -> Any:

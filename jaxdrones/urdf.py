@@ -132,14 +132,20 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
         f"mass, kf and thrust2weight make a highest rotor speed of {max_rpm:.4g} RPM",
         f"expected {_MAX_RPM[0]:g} to {_MAX_RPM[1]:g}; give kf in N/RPM^2 and the mass in kg",
     )
+    # thrust / (density n^2 D^4) with n in 1/s; the bundled vehicles have 0.066 to 0.2
+    coefficient = 3600 * v["kf"] / (AIR_DENSITY * (2 * v["prop_radius"]) ** 4)
+    demand(
+        0.01 <= coefficient <= 1,
+        f"kf and prop_radius make a thrust coefficient of {coefficient:.3g}",
+        "expected 0.01 to 1; give prop_radius in m, and kf in N/RPM^2, which is 0.010966 times that in N/(rad/s)^2",
+    )
     largest = np.max(inertia)
     demand(
         largest <= (np.sum(inertia) - largest) * (1 + 1e-6),
         f"the moments of inertia {short_repr(inertia)} are impossible for a rigid body",
         "give moments of at most the sum of the other two",
     )
-    x, y, _ = v["rotor_pos"].T
-    spin = v["rotor_spin"]
+    (x, y, _), spin = v["rotor_pos"].T, v["rotor_spin"]
     demand(
         np.sum(spin) == 0,
         f'rotor_spin="{" ".join(f"{s:g}" for s in spin)}" makes the drone spin in hover',
@@ -212,8 +218,7 @@ class _Urdf:
             if np.any(values[:count] != 0):
                 raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
         for product in ("ixy", "ixz", "iyz"):
-            path = f"{_BASE}/inertial/inertia"
-            if self.number(path, product, "product of inertia, kg m^2", default="0") != 0:
+            if self.number(f"{_BASE}/inertial/inertia", product, "product of inertia, kg m^2", default="0") != 0:
                 raise UserError(f"{self.name}: {product} is not zero; turn the body axes into principal axes")
         for link in self._root.findall("link"):
             mass = link.find("inertial/mass")

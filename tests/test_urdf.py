@@ -123,6 +123,13 @@ def test_a_missing_file_says_what_to_give(tmp_path):
         ('kf="3.16e-10"', 'kf="1e-50"', r'kf="1e-50".*should be 1e-20 to 1'),
         ('kf="3.16e-10"', 'kf="1e50"', r'kf="1e50".*should be 1e-20 to 1'),
         ('kf="3.16e-10"', 'kf="1e-19"', r"highest rotor speed of 1.22e\+09 RPM; expected 10 to 1e\+06"),
+        (
+            'kf="3.16e-10"',
+            'kf="2.88e-8"',
+            r"make a thrust coefficient of 18.*N/RPM\^2, which is 0.010966 times that in",
+        ),
+        ('kf="3.16e-10"', 'kf="3.16e-12"', r"kf and prop_radius make a thrust coefficient of 0.002"),
+        ('prop_radius="0.0231348"', 'prop_radius="2.3"', r"kf and prop_radius make .*; give prop_radius in m"),
         ('km="7.94e-12"', 'km="1_0"', r'km="1_0".*is not a list of numbers'),
         ('kf="3.16e-10"', f'kf="{"9" * 999}"', r"kf=\"9{100,}\.*.* should be 1 finite"),
         ('thrust2weight="2.25"', 'thrust2weight="0.9"', r"thrust2weight is 0.9, with which a drone cannot hover; give"),

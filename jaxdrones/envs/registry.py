@@ -11,7 +11,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 
 from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
-from jaxdrones.checks import check_finite, check_switch, look_up, short_repr
+from jaxdrones.checks import check_switch, check_vehicle, look_up, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
@@ -114,8 +114,8 @@ def make(
         **options: options of the task, for example `drones`.
 
     Raises:
-        ValueError: an unknown name, a number out of range, or an action type with a controller that is unstable with
-            the vehicle, its rotors or the control rate.
+        ValueError: an unknown name, a number out of range, a vehicle that cannot hover, or an action type with a
+            controller that is unstable with the vehicle, its rotors or the control rate.
         TypeError: an unknown option.
         ImportError: the Bullet backend without pybullet.
     """
@@ -130,7 +130,7 @@ def make(
     randomize = all_randomizations(realistic == "any", task.randomize, randomize or (), vehicle)
     vehicle = "cf2x" if vehicle is None else vehicle
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
-    check_finite("vehicle", nominal)
+    check_vehicle(nominal)
     nominal = equipped(task, nominal_params(randomize, nominal))
     if "payload" in nominal.aux and any(isinstance(one, AnyVehicle) for one in randomize):
         raise UserError(

@@ -120,6 +120,24 @@ def test_an_environment_has_motors_with_a_limit():
         make("hover", vehicle=CRAZYFLIE.replace(max_rpm=jnp.array(jnp.inf)))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (dict(kf=91.19 * CRAZYFLIE.kf), "hovers at 1515 RPM of at most 2.17e.04, with a highest thrust of 205.2 times"),
+        (dict(kf=CRAZYFLIE.kf / 91.19), "hovers at 1.382e.05 RPM of at most 2.17e.04, .* 0.02467 times its weight"),
+        (dict(mass=1000 * CRAZYFLIE.mass), "highest thrust of 0.00225 times its weight; .* mass in kg"),
+        (dict(max_rpm=0.999 * CRAZYFLIE.hover_rpm), "give a ratio above 1 and up to 100"),
+    ],
+)
+def test_constants_in_another_unit_with_which_a_vehicle_cannot_hover_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        make("hover", vehicle=CRAZYFLIE.replace(**wrong))
+
+
+def test_a_vehicle_without_gravity_needs_no_thrust_to_hover():
+    make("hover", vehicle=CRAZYFLIE.replace(gravity=jnp.array(0.0)))
+
+
 def test_a_velocity_is_that_of_the_paper_whoever_flies():
     action = jnp.array([3.0, 0, 4, 0.5])
     for vehicle in VEHICLES:

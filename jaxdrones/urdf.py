@@ -133,10 +133,10 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
         f"expected {_MAX_RPM[0]:g} to {_MAX_RPM[1]:g}; give kf in N/RPM^2 and the mass in kg",
     )
     # thrust / (density n^2 D^4) with n in 1/s; the bundled vehicles have 0.066 to 0.2
-    coefficient = 3600 * v["kf"] / (AIR_DENSITY * (2 * v["prop_radius"]) ** 4)
+    coefficient, hover = 3600 * v["kf"] / (AIR_DENSITY * (2 * v["prop_radius"]) ** 4), max_rpm / thrust2weight**0.5
     demand(
         0.01 <= coefficient <= 1,
-        f"kf and prop_radius make a thrust coefficient of {coefficient:.3g}",
+        f"kf and prop_radius make a thrust coefficient of {coefficient:.3g} and a hover at {hover:.4g} RPM",
         "expected 0.01 to 1; give prop_radius in m, and kf in N/RPM^2, which is 0.010966 times that in N/(rad/s)^2",
     )
     largest = np.max(inertia)

@@ -332,6 +332,16 @@ def test_a_file_of_options_is_read_however_it_is_given(tmp_path):
         assert with_config(["train", "hover", *words]) == read
 
 
+def test_a_task_of_the_command_line_overrides_that_of_a_file(tmp_path):
+    file = tmp_path / "options.toml"
+    file.write_text('task = "hover"\nseeds = 2\n')
+    assert with_config(["train", "--config", str(file)]) == ["train", "hover", "--seeds=2"]
+    assert with_config(["train", "--from", "hover", "--config", str(file)])[:2] == ["train", "hover"]
+    for words in ["tracking", "--seed", "1"], ["--seed", "1", "tracking"], ["--seed=1", "tracking"]:
+        read = with_config(["train", *words, "--config", str(file)])
+        assert read.count("tracking") == 1 and "hover" not in read and "--seeds=2" in read
+
+
 @pytest.mark.slow
 def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
     """Options of the command line override those of the file."""

@@ -115,6 +115,7 @@ def test_a_run_of_user_files_refuses_what_has_changed(here, capsys):
         ),
         (["eval", "runs/hover", "--task", "hover"], "--task is given beside the run runs/hover"),
         (["eval", "runs/hover", "--set", "drones=2"], "--set drones is given beside the run runs/hover"),
+        (["eval", "runs/hover", "--vehicle", "hb"], "--vehicle is given beside the run runs/hover"),
         (["fly", "--policy", "my_policy.py:policy"], "--task is missing"),
         (
             ["fly", "--policy", "my_policy.py:policy", "--task", "hover", "--set", "vehicle=hb"],

@@ -126,7 +126,7 @@ def test_a_missing_file_says_what_to_give(tmp_path):
         (
             'kf="3.16e-10"',
             'kf="2.88e-8"',
-            r"make a thrust coefficient of 18.*N/RPM\^2, which is 0.010966 times that in",
+            r"coefficient of 18.5 and a hover at 1516 RPM; .* N/RPM\^2, which is 0.010966 times that in",
         ),
         ('kf="3.16e-10"', 'kf="3.16e-12"', r"kf and prop_radius make a thrust coefficient of 0.002"),
         ('prop_radius="0.0231348"', 'prop_radius="2.3"', r"kf and prop_radius make .*; give prop_radius in m"),

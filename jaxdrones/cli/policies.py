@@ -85,6 +85,7 @@ def open_policy(
             raise UserError(f"--task is missing; give the task for {policy}, for example --task hover")
         return UserPolicy(str(policy), task, realistic, options)
     given = {"--task": task, "--realistic": realistic, **{f"--set {name}": x for name, x in options.items()}}
+    given["--vehicle"] = given.pop("--set vehicle", None)
     for name, x in given.items():
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which determines it; leave it out")

@@ -64,6 +64,8 @@ def with_config(arguments: list[str]) -> list[str]:
     except (OSError, ValueError) as error:
         raise UserError(f"--config {file} cannot be read: {error}") from None
     task = [entries.pop("task")] if "task" in entries else []
+    if any(_is_positional(words) for words in itertools.pairwise(rest[command:])):
+        task = []
     options = []
     for name, x in entries.items():
         if isinstance(x, dict):  # set and sweep
@@ -74,6 +76,12 @@ def with_config(arguments: list[str]) -> list[str]:
             options.append(f"--{name}" if x is True else f"--{name}={x}")
     first = next((k for k in range(command + 1, len(rest)) if rest[k].startswith("-")), len(rest))
     return [*rest[:first], *task, *options, *rest[first:]]
+
+
+def _is_positional(words: tuple[str, str]) -> bool:
+    """Whether the second of two words is neither an option nor its value."""
+    before, word = words
+    return not word.startswith("-") and (not before.startswith("-") or "=" in before)
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:

@@ -128,7 +128,6 @@ def test_a_missing_file_says_what_to_give(tmp_path):
             'kf="2.88e-8"',
             r"coefficient of 18.5 and a hover at 1516 RPM; .* N/RPM\^2, which is 0.010966 times that in",
         ),
-        ('kf="3.16e-10"', 'kf="3.16e-12"', r"kf and prop_radius make a thrust coefficient of 0.002"),
         ('prop_radius="0.0231348"', 'prop_radius="2.3"', r"kf and prop_radius make .*; give prop_radius in m"),
         ('km="7.94e-12"', 'km="1_0"', r'km="1_0".*is not a list of numbers'),
         ('kf="3.16e-10"', f'kf="{"9" * 999}"', r"kf=\"9{100,}\.*.* should be 1 finite"),

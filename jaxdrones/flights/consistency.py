@@ -183,6 +183,8 @@ def _check_scales(motion: Motion) -> list[str]:
     cause = (
         "t runs at another rate than the flight (a wrong clock)" if clock else "pos or vel has another unit or scale"
     )
+    if values == [turns] and any(ratio is not None for name, (ratio, _) in ratios.items() if name.endswith("vel")):
+        cause = "omega has another unit or scale"  # a wrong clock would scale distances, too
     return [f"{'; '.join(off)} instead of 1: {cause}"]
 
 

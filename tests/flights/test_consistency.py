@@ -132,6 +132,8 @@ def test_rates_in_world_axes_are_named_in_a_turning_flight(heading_rate):
     assert contradictions(sound, np.zeros((0, 4)), 0.0) == []
     (said,) = contradictions(sound._replace(omega=attitude.apply(omega)), np.zeros((0, 4)), 0.0)
     assert "omega looks like world axes" in said
+    (said,) = contradictions(sound._replace(omega=1.3 * omega), np.zeros((0, 4)), 0.0)
+    assert "turns of quat" in said and said.endswith("instead of 1: omega has another unit or scale")
 
 
 def test_a_battery_that_is_charged_by_its_load_is_refused(tmp_path, columns_of):

@@ -22,6 +22,7 @@ _MOVES = frozenset(  # primitives that rearrange the entries of their inputs
     "expand_dims unstack dynamic_slice dynamic_update_slice scatter".split()
 )
 _MOVED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}  # others: indices
+_LOGICAL = ("and", "not", "or", "xor")  # of booleans; of integers they act on bits
 _UNCHANGED = frozenset(  # primitives that leave values unchanged
     "stop_gradient optimization_barrier copy_start copy_done reduce_precision name xla_metadata_value".split()
 )
@@ -85,7 +86,8 @@ def _evaluate_equation(equation: Equation, inputs: list[np.ndarray]) -> list[np.
         return inputs
     if name in _MOVES:
         return _moved(equation, inputs)
-    if name in ELEMENTWISE:
+    bitwise = name in _LOGICAL and np.dtype(equation.invars[0].aval.dtype).kind != "b"
+    if name in ELEMENTWISE and not bitwise:
         return [_elementwise(lambda *x: ELEMENTWISE[name](*x, **params), inputs)]
     if name in REDUCTIONS:
         return [_reduced(REDUCTIONS[name], inputs[0], params["axes"])]

@@ -144,8 +144,13 @@ def test_what_has_no_counterpart_is_named():
     def sorting(params, state):
         return jd.Wrench.of_force(jnp.sort(state.vel))
 
+    def bits(params, state):
+        return jd.Wrench.of_force(state.vel * (state.vel.astype(int) & 1))
+
     with pytest.raises(NotImplementedError, match=r"primitive 'sort'.*write the effect or model without it"):
         twin("cf2x", [sorting])
+    with pytest.raises(NotImplementedError, match=r"primitive 'and'.*write the effect or model without it"):
+        twin("cf2x", [bits])
     with pytest.raises(ValueError, match=r"unknown field of Params 'winds'; did you mean 'wind'"):
         twin("cf2x", parameters=["winds"])
     with pytest.raises(ValueError, match=r"pairs or team_effects are given and the constants are of one drone"):

@@ -29,9 +29,10 @@ def over_worlds(
     """Vectorize a function of one world over many worlds, like `jax.vmap`, and compile it.
 
     It accepts every traceable function. The first call with arguments of some shapes compiles, like `jax.jit`, and
-    later calls reuse the program, so keep the returned function. Closed-over values are fixed at the first call. Inside
-    of `jax.jit`, `jax.grad` or another transformation it is traced like any other function, which is slower on a CPU:
-    take derivatives inside, `over_worlds(jax.grad(miss))`.
+    later calls reuse the program, so keep the returned function. Closed-over values are fixed at the first call; values
+    that change, such as the weights of a network, are arguments of a `jax.jit` around it. Inside of `jax.jit`,
+    `jax.grad` or another transformation it is traced like any other function, which is slower on a CPU: take
+    derivatives inside, `over_worlds(jax.grad(miss))`.
 
     On a CPU the worlds are computed in chunks that fit in the cache. A function of loops and arithmetic, such as a
     flight or its gradient, is compiled to a single kernel on one core; on an accelerator each iteration of its loops is
@@ -182,7 +183,7 @@ def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
         if axis is None:
             raise UserError(
                 "an axis of in_axes is None; close over an argument that all worlds share, for example "
-                "over_worlds(lambda start: fly(params, start))"
+                "over_worlds(lambda start: fly(params, start)), inside of a jax.jit of it if it changes between calls"
             )
         check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):

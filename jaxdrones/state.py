@@ -8,7 +8,8 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import checked, shape
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_shape, short_repr
+from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
 _ROWS = shape("n", 3, meaning="one row (x, y, z) per drone, at least one drone", finite=True)
@@ -48,6 +49,8 @@ class State(PyTreeNode):
 
 
 def _check_team(name: str, state: Any) -> None:
+    if not isinstance(state, State):
+        raise UserError(f"{name} is {short_repr(state)}; give a jaxdrones.State of a team")
     check_shape(
         f"{name}.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap"
     )

@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones import State, rotation
+from jaxdrones import State, load_params, repeat, rotation
+from jaxdrones.sensing import Scene, photograph
 
 
 def test_a_team_at_rest_is_level_and_still():
@@ -49,3 +50,9 @@ def test_a_traced_height_may_stand_among_numbers():
 def test_a_bad_start_says_what_is_wrong(pos, yaw, message):
     with pytest.raises(ValueError, match=message):
         State.at_rest(pos, yaw)
+
+
+@pytest.mark.parametrize("given", [None, jnp.zeros((1, 3))])
+def test_what_is_not_a_state_is_no_team(given):
+    with pytest.raises(ValueError, match=r"state is .*; give a jaxdrones\.State of a team"):
+        photograph(Scene(), repeat(load_params("cf2x"), 1), given, (2.0, 0, 1), (0.0, 0, 1))

@@ -346,6 +346,8 @@ def test_realistic_any_draws_vehicles_before_what_else_is_drawn():
 def test_a_vehicle_beside_drawn_ones_is_refused():
     with pytest.raises(ValueError, match="vehicle='hb' is given, but every episode draws a vehicle already; leave out"):
         jd.make("hover", realistic="any", vehicle="hb")
+    with pytest.raises(ValueError, match=r"^a vehicle is given, but every episode"):
+        jd.make("hover", realistic="any", vehicle=jd.load_params("hb"))
     with pytest.raises(ValueError, match="another AnyVehicle is given"):
         jd.make("hover", randomize=(AnyVehicle(0.02, 0.1), AnyVehicle()))
     with pytest.raises(ValueError, match="realistic is 'all'; give True or False or 'any'"):

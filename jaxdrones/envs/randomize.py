@@ -143,7 +143,8 @@ def all_randomizations(
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):
-        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={short_repr(vehicle)}"
+        named = "a vehicle" if isinstance(vehicle, Params) else f"vehicle={short_repr(vehicle)}"
+        other = "another AnyVehicle" if len(whole) > 1 else named
         raise UserError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
     return (*whole, *rest)
 

@@ -115,7 +115,7 @@ def make_step(
         team_effects: wrenches on all drones of the team, `(params, state) -> Wrench` with force and torque (n, 3), such
             as cables between drones.
         models: additional differential equations, such as a battery; their states are in `state.aux`.
-        neighbors: limits pairs to nearby drones, which is faster from about 700 drones on.
+        neighbors: limits pairs to nearby drones, which is faster for teams of several hundred drones.
         scene: default scene of effects with a `scene` parameter. A call can override it.
 
     Returns:

@@ -23,6 +23,7 @@ __all__ = ("FRAME", "GATES", "OPENING", "POLES", "START", "gates")
 _START_SPACING = 0.5  # m in y between drones at the start
 _MAX_SPREAD = 0.15  # m, so that drones stay apart at the start
 _MAX_DRONES = 5  # so that all drones start inside the arena
+_CRASH = 60.0  # control steps whose time penalty a crash costs
 _SIGHT = 3.0  # m, at which the observed positions of poles are clipped
 
 _POLE_ENTRIES = tuple(
@@ -37,6 +38,7 @@ def gates(
     duration: float = 12.0,
     random_start: Switch = False,
     start_spread: Annotated[float, number("m", at_least=0, at_most=_MAX_SPREAD)] = 0.0,
+    time_penalty: Annotated[float, number(at_least=0)] = 0.0,
 ) -> Task:
     """One lap through four gates.
 
@@ -50,6 +52,8 @@ def gates(
         random_start: for training: start in the air in front of a random gate with probability 0.8, else on the ground
             at the start of the track.
         start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
+        time_penalty: reward lost in every control step, and 60 times as much in a crash, so that it never pays to crash
+            early: for faster laps of a policy that already finishes them.
     """
     scene = racetrack.scene_of(level)
 
@@ -96,10 +100,11 @@ def gates(
         rewards={
             "progress": (10.0, shaping.variable("progress", "Approach to the next gate in the last step, m.")),
             "passed": (5.0, racetrack.passed),
-            "crashed": (-10.0, racetrack.crash),
+            "crashed": (-10.0 - _CRASH * time_penalty, racetrack.crash),
             "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-        },
+        }
+        | ({"time": (-time_penalty, shaping.alive)} if time_penalty else {}),
         terminations={"finished": finished, "crashed": racetrack.crashed}
         | shaping.out_of_control(ARENA, center=MIDDLE),
         advance=_advance,

@@ -91,6 +91,7 @@ def is_due(step: jax.Array, period: float) -> jax.Array:
 
     The period, in steps, is taken for the nearest fraction with integers that fit, so that rounding never adds up.
     """
+    period = min(period, _INTEGERS - 1)
     most = max(1, min(_LARGEST_DENOMINATOR, int((_INTEGERS / period) ** 0.5)))
     steps, times = Fraction(period).limit_denominator(most).as_integer_ratio()
     return step % steps * times % steps < times

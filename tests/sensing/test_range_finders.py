@@ -188,6 +188,7 @@ def test_a_measurement_is_due_after_hours_as_in_the_first_minute(rate, control_h
     clock = Sensor("clock", lambda key, params, state, rate, scene, memory: (None, 0.0), rate=float(rate))
     np.testing.assert_array_equal(clock.is_due(jnp.asarray(steps), 1 / control_hz), count > before)
     np.testing.assert_array_equal(is_due(jnp.asarray(steps), control_hz / rate), count > before)
+    assert not is_due(jnp.asarray(steps[1:]), 1e12).any()  # longer than any episode
 
 
 @pytest.mark.slow

@@ -20,15 +20,14 @@ import numpy as np
 import jaxdrones as jd
 from benchmarks.common import success_rate
 from jaxdrones.learning import checkpoint, evaluate
-from jaxdrones.tasks.racetrack import GATES, OPENING, POLE_RADIUS, POLES, START
+from jaxdrones.tasks.racetrack import GATES, OPENING, POLE_HEIGHT, POLE_RADIUS, POLES, START
 from jaxdrones.tasks.starts import standing_height
 
 if TYPE_CHECKING:
     import casadi as ca
 
 SPREAD = 0.05  # m, of the starts about that of the bounds
-_SHARPNESS = 8  # exponent of the smooth bodies in place of beams with rounded edges
-_MARGIN = 0.0015  # m, by which these are larger
+_SHARPNESS = 8  # exponent of the rough beams
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,8 +69,11 @@ def lap_bounds(env: jd.envs.Env, nodes: int) -> dict[str, float]:
         "drone": fastest(mass, narrow),
         "centers": fastest(mass, dataclasses.replace(track, half=1e-6)),
     }
-    flights["clear"] = fastest(mass, clear, flights["drone"])
-    flights["vehicle"] = fastest(vehicle(params, start), clear, flights["clear"])
+    rough = dataclasses.replace(clear, solids=solids(env, radius, rough=True))
+    body = vehicle(params, start)
+    turning = fastest(body, clear, fastest(body, rough, flights["drone"]))
+    flights["clear"] = fastest(mass, clear, turning)
+    flights["vehicle"] = fastest(body, clear, flights["clear"])
     return {name: float(flight.times.sum()) for name, flight in flights.items()}
 
 
@@ -171,8 +173,12 @@ def vehicle(params: jd.Params, start: np.ndarray) -> Body:
     )
 
 
-def solids(env: jd.envs.Env, radius: float) -> list[Callable[["ca.MX"], "ca.MX"]]:
-    """Frames and poles of the track, larger by the radius of a drone (m)."""
+def solids(env: jd.envs.Env, radius: float, rough: bool = False) -> list[Callable[["ca.MX"], "ca.MX"]]:
+    """Frames and poles of the track, larger by the radius of a drone (m).
+
+    Inside a beam the derivatives are zero; the `rough` one in its place, with edges that are less round, pushes flights
+    that begin there out of it.
+    """
     import casadi as ca
 
     boxes = env.scene.boxes
@@ -181,11 +187,17 @@ def solids(env: jd.envs.Env, radius: float) -> list[Callable[["ca.MX"], "ca.MX"]
     def beam(center: np.ndarray, size: np.ndarray, heading: float) -> Callable[[ca.MX], ca.MX]:
         cos, sin = np.cos(heading), np.sin(heading)
         axes = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        share = axes / (size / 2 + radius + _MARGIN)[:, None]
-        return lambda pos: ca.log(ca.sum1((share @ (pos - center)) ** _SHARPNESS) + 1e-3) - np.log(1 + 1e-3)
+        share = axes / (size / 2 + radius)[:, None]
+        if rough:
+            return lambda pos: ca.log(ca.sum1((share @ (pos - center)) ** _SHARPNESS) + 1e-3) - np.log(1 + 1e-3)
+        return lambda pos: ca.sumsqr(ca.fmax(ca.fabs(axes @ (pos - center)) - size / 2, 0)) - radius**2
 
     def pole(place: np.ndarray) -> Callable[[ca.MX], ca.MX]:
-        return lambda pos: ca.sumsqr(pos[:2] - place) - (POLE_RADIUS + radius) ** 2
+        def outside(pos: ca.MX) -> ca.MX:
+            above = ca.fmax(pos[2] - POLE_HEIGHT, 0)
+            return above**2 + ca.fmax(ca.sqrt(ca.sumsqr(pos[:2] - place)) - POLE_RADIUS, 0) ** 2 - radius**2
+
+        return outside
 
     beams = zip(np.asarray(boxes.pos, float), np.asarray(boxes.size, float), headings, strict=True)
     return [*(beam(*one) for one in beams), *map(pole, POLES)]

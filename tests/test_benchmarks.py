@@ -192,19 +192,33 @@ def test_self_play_reports_teams_and_single_drones_of_every_policy():
 
 @pytest.mark.needs("casadi")
 @pytest.mark.slow
-def test_the_less_of_a_gate_a_lap_may_use_the_longer_it_takes():
+def test_the_less_of_a_gate_a_lap_may_use_the_longer_it_takes_and_a_body_that_turns_is_slower():
     bounds = quick("lap")["bounds"]
     assert 1 < bounds["openings"] < bounds["drone"] < bounds["centers"] < 2.5
+    assert bounds["drone"] < bounds["clear"] < bounds["vehicle"] < 2.5
 
 
 @pytest.mark.needs("casadi")
 def test_the_fastest_flight_to_a_gate_straight_ahead_is_that_of_a_constant_acceleration():
     """From rest, without gravity, and with a weight that the thrust carries beside the acceleration."""
-    gate = np.array([[2.0, 0.0, 1.0, 0.0]])
-    start = np.array([0.0, 0.0, 1.0])
+    track = lap.Track(np.array([[2.0, 0.0, 1.0, 0.0]]), half=1e-6, nodes=20)
     for thrust, gravity, acc in ((10.0, 0.0, 10.0), (5.0, 3.0, 4.0)):
-        time = lap.fastest(gate, start, thrust, gravity, 1e-6, 20)
-        np.testing.assert_allclose(time, np.sqrt(2 * 2.0 / acc), rtol=2e-3)
+        flight = lap.fastest(lap.point_mass(thrust, gravity, np.array([0.0, 0.0, 1.0])), track)
+        np.testing.assert_allclose(flight.times, np.sqrt(2 * 2.0 / acc), rtol=2e-3)
+        np.testing.assert_allclose(flight.pos[-1], track.gates[0, :3], atol=1e-5)
+
+
+@pytest.mark.needs("casadi")
+@pytest.mark.slow
+@pytest.mark.float32
+def test_laps_keep_clear_of_what_a_drone_touches():
+    env, radius = jd.make("gates"), 0.06
+    near = np.vstack([lap.GATES[:, :3], np.c_[lap.POLES, [1.5] * 4]])
+    places = (near + np.random.default_rng(0).uniform(-0.5, 0.5, (40, 8, 3))).reshape(-1, 3)
+    gap = np.asarray(jax.vmap(env.scene.replace(ground=False).distance)(places)) - radius
+    outside = np.array([min(float(solid(place)) for solid in lap.solids(env, radius)) for place in places])
+    np.testing.assert_array_equal(outside > 0, gap > 0)
+    assert np.sum(gap < 0) > 20
 
 
 def test_accelerator_names_tests_that_exist():

@@ -3,9 +3,9 @@
 Level 0 of the task `gates`, one drone, from rest on the ground to the last gate. Bounds are the fastest flights of a
 point mass with the maximum thrust of the vehicle in any direction without delay: `openings`: it may pass anywhere in
 the openings; `drone`: with a drone's radius between its center and the frame of the gate that it passes; `centers`:
-through the centers; `clear`: with a drone's radius to all frames and poles, all the time. `vehicle` is the same for the
-rigid body, whose rotors follow their commands at once. They are local solutions of IPOPT (CasADi), without drag, with
-`--nodes` intervals per gate.
+through the centers. `vehicle` is the fastest lap found for the rigid body, whose rotors follow their commands at once,
+with a drone's radius to all frames and poles all the time. They are local solutions of IPOPT (CasADi), without drag,
+with `--nodes` intervals per gate; few nodes allow flights through frames between them.
 """
 
 import argparse
@@ -20,14 +20,16 @@ import numpy as np
 import jaxdrones as jd
 from benchmarks.common import success_rate
 from jaxdrones.learning import checkpoint, evaluate
-from jaxdrones.tasks.racetrack import GATES, OPENING, POLE_HEIGHT, POLE_RADIUS, POLES, START
+from jaxdrones.tasks.racetrack import GATES, OPENING, POLE_RADIUS, POLES, START
 from jaxdrones.tasks.starts import standing_height
 
 if TYPE_CHECKING:
     import casadi as ca
 
 SPREAD = 0.05  # m, of the starts about that of the bounds
-_SHARPNESS = 8  # exponent of the rough beams
+_BARRIER_AT_FIRST, _BARRIER_NEAR = 0.1, 1e-3  # of the interior-point method; near a solution it is small
+_SHARPNESS = 8  # exponent of the superellipsoids in place of beams, which are nowhere more than
+_MARGIN = 0.006  # m too thin
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,11 +71,7 @@ def lap_bounds(env: jd.envs.Env, nodes: int) -> dict[str, float]:
         "drone": fastest(mass, narrow),
         "centers": fastest(mass, dataclasses.replace(track, half=1e-6)),
     }
-    rough = dataclasses.replace(clear, solids=solids(env, radius, rough=True))
-    body = vehicle(params, start)
-    turning = fastest(body, clear, fastest(body, rough, flights["drone"]))
-    flights["clear"] = fastest(mass, clear, turning)
-    flights["vehicle"] = fastest(body, clear, flights["clear"])
+    flights["vehicle"] = fastest(vehicle(params, start), clear, flights["drone"])
     return {name: float(flight.times.sum()) for name, flight in flights.items()}
 
 
@@ -173,12 +171,8 @@ def vehicle(params: jd.Params, start: np.ndarray) -> Body:
     )
 
 
-def solids(env: jd.envs.Env, radius: float, rough: bool = False) -> list[Callable[["ca.MX"], "ca.MX"]]:
-    """Frames and poles of the track, larger by the radius of a drone (m).
-
-    Inside a beam the derivatives are zero; the `rough` one in its place, with edges that are less round, pushes flights
-    that begin there out of it.
-    """
+def solids(env: jd.envs.Env, radius: float) -> list[Callable[["ca.MX"], "ca.MX"]]:
+    """Frames and poles of the track, larger by the radius of a drone (m), with round edges."""
     import casadi as ca
 
     boxes = env.scene.boxes
@@ -187,17 +181,11 @@ def solids(env: jd.envs.Env, radius: float, rough: bool = False) -> list[Callabl
     def beam(center: np.ndarray, size: np.ndarray, heading: float) -> Callable[[ca.MX], ca.MX]:
         cos, sin = np.cos(heading), np.sin(heading)
         axes = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        share = axes / (size / 2 + radius)[:, None]
-        if rough:
-            return lambda pos: ca.log(ca.sum1((share @ (pos - center)) ** _SHARPNESS) + 1e-3) - np.log(1 + 1e-3)
-        return lambda pos: ca.sumsqr(ca.fmax(ca.fabs(axes @ (pos - center)) - size / 2, 0)) - radius**2
+        share = axes / (size / 2 + radius + _MARGIN)[:, None]
+        return lambda pos: ca.log(ca.sum1((share @ (pos - center)) ** _SHARPNESS) + 1e-3) - np.log(1 + 1e-3)
 
     def pole(place: np.ndarray) -> Callable[[ca.MX], ca.MX]:
-        def outside(pos: ca.MX) -> ca.MX:
-            above = ca.fmax(pos[2] - POLE_HEIGHT, 0)
-            return above**2 + ca.fmax(ca.sqrt(ca.sumsqr(pos[:2] - place)) - POLE_RADIUS, 0) ** 2 - radius**2
-
-        return outside
+        return lambda pos: ca.sumsqr(pos[:2] - place) - (POLE_RADIUS + radius) ** 2
 
     beams = zip(np.asarray(boxes.pos, float), np.asarray(boxes.size, float), headings, strict=True)
     return [*(beam(*one) for one in beams), *map(pole, POLES)]
@@ -209,15 +197,15 @@ def fastest(body: Body, track: Track, like: Flight | None = None) -> Flight:
 
     problem, gates, nodes = ca.Opti(), track.gates, track.nodes
     start = body.pos(body.start)
-    like = like or _straight(gates, start, nodes)
-    acc = np.diff(like.vel, axis=0, prepend=np.zeros((1, 3))) / np.repeat(like.times / nodes, nodes)[:, None]
-    x, u = problem.variable(len(body.start), len(like.pos) + 1), problem.variable(body.inputs, len(like.pos))
+    first = like or _straight(gates, start, nodes)
+    acc = np.diff(first.vel, axis=0, prepend=np.zeros((1, 3))) / np.repeat(first.times / nodes, nodes)[:, None]
+    x, u = problem.variable(len(body.start), len(first.pos) + 1), problem.variable(body.inputs, len(first.pos))
     times = problem.variable(len(gates))
     problem.set_initial(x[:, 0], body.start)
-    problem.set_initial(times, like.times)
+    problem.set_initial(times, first.times)
     problem.subject_to(x[:, 0] == body.start)
     problem.subject_to(times >= 0.02)
-    for k, (pos, vel, a) in enumerate(zip(like.pos, like.vel, acc, strict=True)):
+    for k, (pos, vel, a) in enumerate(zip(first.pos, first.vel, acc, strict=True)):
         after, before = x[:, k + 1], x[:, k]
         problem.subject_to(after == body.step(before, u[:, k], times[k // nodes] / nodes))
         problem.subject_to(problem.bounded(0, body.limits(u[:, k]), 1))
@@ -235,7 +223,9 @@ def fastest(body: Body, track: Track, like: Flight | None = None) -> Flight:
         problem.subject_to(problem.bounded(-track.half, ca.dot([-sin, cos, 0], off), track.half))
         problem.subject_to(problem.bounded(-track.half, off[2], track.half))
     problem.minimize(ca.sum1(times))
-    problem.solver("ipopt", {"print_time": False, "expand": True}, {"print_level": 0, "max_iter": 3000, "sb": "yes"})
+    barrier = _BARRIER_AT_FIRST if like is None else _BARRIER_NEAR
+    settings = {"print_level": 0, "max_iter": 3000, "sb": "yes", "mu_init": barrier}
+    problem.solver("ipopt", {"print_time": False, "expand": True}, settings)
     found = problem.solve()
     states = found.value(x).T[1:]
     pos, vel = (np.stack([part(state) for state in states]) for part in (body.pos, body.vel))

@@ -112,6 +112,8 @@ TRAININGS = {
     "train hover --realistic any --output runs/any": Short(
         f"hover by bptt, realistic, any vehicle: ... {TRAINED}", TRAINING
     ),
+    "train --config examples/fast_lap.toml --output runs/lap": Short(f"gates by ppo, .* {TRAINED}", TRAINING),
+    "train --config examples/faster_lap.toml --output runs/lap2": Short(f"gates by ppo, .* {TRAINED}", TRAINING),
     "train forest": Short(f"forest by bptt ... {TRAINED}", TRAINING),
     "train crowd": Short(f"crowd by bptt ... {TRAINED}", f"{TRAINING} --set horizon=4"),
     "fly --policy runs/crowd --drones 64": Short(f"crowd by bptt, drones 64, policy of runs/crowd ... {LOGGED}"),
@@ -212,6 +214,7 @@ def test_a_flight_of_a_page_prints_what_it_is_for(command, tmp_path, monkeypatch
 )
 def test_the_trainings_of_a_page_can_be_interrupted_resumed_evaluated_and_flown(block, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    Path("examples").symlink_to(ROOT / "examples")
     here = ours(block)
     shorts = {command: (TRAININGS | FLIGHTS)[command] for command in here}
     for library in sorted({library for short in shorts.values() for library in short.needs}):

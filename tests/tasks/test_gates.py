@@ -52,6 +52,18 @@ def test_a_gate_is_passed_by_its_opening_hit_by_its_frame_and_missed_beside_it(a
     assert after["index"][0] == passes and bool(after["hit"][0]) == hits
 
 
+def test_the_time_penalty_costs_every_step_and_a_crash_sixty_of_them():
+    hurried = make("gates", time_penalty=0.5)
+    for aside, penalty in ((0.0, 0.5), (OPENING / 2 + FRAME / 2, 0.5 + 60 * 0.5)):
+        after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + 0.05 * THROUGH))
+        world = start_of_race().replace(variables=after)
+        plain, less = (
+            sum(weight * term(env.task, world) for weight, term in env.task.rewards.values())
+            for env in (ENV(), hurried)
+        )
+        np.testing.assert_allclose(plain - less, penalty, rtol=1e-6)
+
+
 def test_other_gates_than_the_next_one_are_hit_too():
     assert moved(in_gate(-THROUGH, GATES[2]), in_gate((OPENING / 2) * LEFT, GATES[2]))["hit"][0]
 

@@ -49,6 +49,8 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "hover": {},
 }
 """Task -> options."""
+_FIRST_SEED = {"swap-goals": 2}
+"""Task -> seed of the first episode that is tried; by default 0. In that of `swap-goals` all cross the ring."""
 _SHOWN: dict[str, dict[str, bool]] = {"wake": {"jets": True}}
 """Task -> what the page shows from the start."""
 _OWN, _TWENTY, _REAL, _WORD = "fly it yourself", "fly twenty", "real flight", "thousand drones"
@@ -134,7 +136,8 @@ def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
     """The first successful episode of a few."""
     with jd.make(task, **options) as env:
         policy = jd.make_policy(task, env)
-        episodes = (fly_episode(env, policy, jax.random.key(seed)) for seed in range(5))
+        first = _FIRST_SEED.get(task, 0)
+        episodes = (fly_episode(env, policy, jax.random.key(seed)) for seed in range(first, first + 5))
         episode = next(episode for episode in episodes if episode.success is not False)
         about = f"{env.task.summary[0].upper()}{env.task.summary[1:]}. {_success(task)}"
     (record,) = records_of(episode, dict.fromkeys(("params", "dt", "targets", "labels", "images")))

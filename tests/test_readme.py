@@ -112,8 +112,12 @@ TRAININGS = {
     "train hover --realistic any --output runs/any": Short(
         f"hover by bptt, realistic, any vehicle: ... {TRAINED}", TRAINING
     ),
-    "train --config examples/fast_lap.toml --output runs/lap": Short(f"gates by ppo, .* {TRAINED}", TRAINING),
-    "train --config examples/faster_lap.toml --output runs/lap2": Short(f"gates by ppo, .* {TRAINED}", TRAINING),
+    "train --config examples/fast_lap.toml --output runs/lap": Short(
+        f"gates by ppo, time_penalty ... {TRAINED}", TRAINING.replace("--budget 2", "--set updates=2")
+    ),
+    "train --config examples/faster_lap.toml --output runs/lap2": Short(
+        f"gates by ppo, time_penalty ... {TRAINED}", TRAINING.replace("--budget 2", "--set updates=2")
+    ),
     "train forest": Short(f"forest by bptt ... {TRAINED}", TRAINING),
     "train crowd": Short(f"crowd by bptt ... {TRAINED}", f"{TRAINING} --set horizon=4"),
     "fly --policy runs/crowd --drones 64": Short(f"crowd by bptt, drones 64, policy of runs/crowd ... {LOGGED}"),

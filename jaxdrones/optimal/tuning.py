@@ -1,7 +1,6 @@
 """Gradient-based tuning of a controller's gains in simulated test flights."""
 
 import functools
-from collections.abc import Callable
 from types import ModuleType
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
+from jaxdrones.accelerate.compiler import training_options
 from jaxdrones.arguments import Count, checked, whole
 from jaxdrones.checks import look_up, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
@@ -49,6 +49,7 @@ _EVALUATION_SECONDS = 8.0  # s, duration of the final evaluation, long enough fo
 _FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the step from the initial to the optimized gains, in logarithms
 _SMOOTHING = 2e-3  # m; below it the penalty on the distance is quadratic
 _CURVES = (("circle", 5.0), ("figure-eight", 4.0), ("lissajous", 7.0))  # period, s
+_FLIGHTS = 24  # eight of each of three vehicles
 _LAG_FACTOR = 1.5  # rotor lag of the heavy vehicle over that of the vehicle
 _MASS_FACTOR = 1.2  # its mass and inertia over those of the vehicle
 _LEARNING_RATE = 0.1  # for the logarithm of a gain, at the first iteration; it decays to zero
@@ -92,7 +93,7 @@ def tune(
     """
     module = _tunable(controller)
     check_single("params.mass", params, "tune takes the parameters of a single drone")
-    gains, error = _descend(module, control_hz, iterations, params, start(module, params))
+    gains, error = _compiled()(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
         raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")
     return gains
@@ -126,7 +127,11 @@ def _name(module: Any) -> str:
     return module.__name__.rpartition(".")[2] if isinstance(module, ModuleType) else short_repr(module)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@functools.cache
+def _compiled() -> Any:
+    return jax.jit(_descend, static_argnums=(0, 1, 2), compiler_options=training_options(large_arrays=False))
+
+
 def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start: Any) -> tuple[Any, Float[Array, ""]]:
     """Best gains of two descents, from the initial gains and from the best loop speeds, and their error."""
 
@@ -140,38 +145,42 @@ def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start
             for name, power in _TUNED[module].items()
         }
 
-    def each_flight(at: dict[str, Array]) -> dict[str, Array]:
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), at)
+    def errors(each: dict[str, Array], seconds: float = _SECONDS) -> Float[Array, "sets flights"]:
+        return _errors_of_flights(module, params, hz, seconds, jax.vmap(jax.vmap(gains_of))(each))
 
-    def errors(each: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        of_flights = flown(jax.vmap(gains_of)(each))
-        value = jnp.mean(of_flights)
-        return jnp.sum(of_flights), jnp.where(jnp.isfinite(value), value, jnp.inf)
+    def in_each_flight(logarithms: dict[str, Array]) -> dict[str, Array]:
+        return jax.tree.map(lambda x: jnp.repeat(x[:, None], _FLIGHTS, axis=1), logarithms)
+
+    def total(each: dict[str, Array]) -> tuple[Float[Array, ""], Float[Array, " sets"]]:
+        of_flights = errors(each)
+        return jnp.sum(of_flights), _finite(jnp.mean(of_flights, axis=1))
 
     def advance(carry: tuple, _: None) -> tuple[tuple, None]:
         at, memory, best, lowest = carry
-        (_, value), gradients = jax.value_and_grad(errors, has_aux=True)(each_flight(at))
-        best = jax.tree.map(lambda x, y: jnp.where(value < lowest, x, y), at, best)
-        gradient = jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.vmap(_clipped)(gradients))
+        (_, value), gradients = jax.value_and_grad(total, has_aux=True)(in_each_flight(at))
+        best = jax.vmap(lambda better, *two: jax.tree.map(lambda x, y: jnp.where(better, x, y), *two))(
+            value < lowest, at, best
+        )
+        gradient = jax.tree.map(lambda x: jnp.mean(x, axis=1), jax.vmap(jax.vmap(_clipped))(gradients))
         change, memory = optimizer.update(gradient, memory)
         return (optax.apply_updates(at, change), memory, best, jnp.minimum(value, lowest)), None
 
-    def descend(at: dict[str, Array]) -> tuple[dict[str, Array], Float[Array, ""]]:
-        carry = (at, optimizer.init(at), at, jnp.full((), jnp.inf, params.mass.dtype))
-        return jax.lax.scan(advance, carry, length=iterations)[0][2:]
-
-    flights, flown = _test_flights(module, params, hz, _SECONDS)
     optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, iterations))
     speeds = jnp.meshgrid(jnp.asarray(_OUTER_SPEEDS, float), jnp.asarray(_INNER_SPEEDS, float))
     starts = jax.vmap(with_speeds)(*(x.ravel() for x in speeds))
-    errors_of_starts = jax.vmap(lambda at: errors(each_flight(at))[1])(starts)
-    two = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x[0]), x[jnp.argmin(errors_of_starts)]]), starts)
-    found, _ = jax.vmap(descend)(two)
+    fastest = jnp.argmin(_finite(jnp.mean(errors(in_each_flight(starts)), axis=1)))
+    two = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x[0]), x[fastest]]), starts)
+    carry = (two, optimizer.init(two), two, jnp.full(2, jnp.inf, params.mass.dtype))
+    found = jax.lax.scan(advance, carry, length=iterations)[0][2]
     shares = jnp.asarray(_FRACTIONS, float)
     candidates = jax.tree.map(lambda x: jnp.concatenate([share * x for share in shares]), found)
-    _, evaluate = _test_flights(module, params, hz, _EVALUATION_SECONDS)
-    costs = _costs(jax.vmap(lambda at: evaluate(jax.vmap(gains_of)(each_flight(at))))(candidates))
+    costs = _costs(errors(in_each_flight(candidates), _EVALUATION_SECONDS))
     return gains_of(jax.tree.map(lambda x: x[jnp.argmin(costs)], candidates)), jnp.min(costs)
+
+
+def _finite(error: Float[Array, " sets"]) -> Float[Array, " sets"]:
+    """Errors, infinite where they are not finite."""
+    return jnp.where(jnp.isfinite(error), error, jnp.inf)
 
 
 def _costs(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
@@ -180,8 +189,7 @@ def _costs(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
     The deterioration of a flight is measured against the first gains.
     """
     first = jnp.where(jnp.isfinite(errors[:1]), errors[:1], jnp.inf)
-    value = jnp.mean(errors, axis=-1) + jnp.max(jnp.maximum(errors - first - _MAX_DETERIORATION, 0), axis=-1)
-    return jnp.where(jnp.isfinite(value), value, jnp.inf)
+    return _finite(jnp.mean(errors, axis=-1) + jnp.max(jnp.maximum(errors - first - _MAX_DETERIORATION, 0), axis=-1))
 
 
 def _clipped(gradient: dict[str, Array]) -> dict[str, Array]:
@@ -191,10 +199,13 @@ def _clipped(gradient: dict[str, Array]) -> dict[str, Array]:
     return jax.tree.map(lambda x: jnp.where(jnp.isfinite(length), share * x, 0), gradient)
 
 
-def _test_flights(
-    module: ModuleType, params: Params, hz: int, seconds: float
-) -> tuple[int, Callable[[Any], Float[Array, " flights"]]]:
-    """Number of flights, and function from the gains of each flight to the errors of the flights."""
+def _errors_of_flights(
+    module: ModuleType, params: Params, hz: int, seconds: float, gains: Any
+) -> Float[Array, "sets flights"]:
+    """Errors of the test flights of sets of gains, with a first axis of sets and a second of `_FLIGHTS`.
+
+    The flights are simulated as those of one team without interaction: another axis takes ten times as long to compile.
+    """
 
     def lagging(times: float) -> Params:
         names = ("rotor_rise_time", "rotor_fall_time")
@@ -203,22 +214,24 @@ def _test_flights(
     slow = lagging(_LAG_FACTOR).replace(mass=_MASS_FACTOR * params.mass, inertia=_MASS_FACTOR * params.inertia)
     vehicles = (lagging(0), lagging(1), slow)
     start, targets = _starts_and_targets(params, hz, seconds)
-    each = len(start.pos)
-    n = len(vehicles) * each
-    team = jax.tree.map(lambda *x: jnp.concatenate(x), *(repeat(vehicle, each) for vehicle in vehicles))
-    start = jax.tree.map(lambda x: jnp.concatenate([x] * len(vehicles)), start)
-    targets = jax.tree.map(lambda x: jnp.concatenate([x] * len(vehicles), axis=1), targets)
+    sets, each = len(jax.tree.leaves(gains)[0]), len(start.pos)
+
+    def of_all(x: Array, axis: int = 0) -> Array:
+        """One entry for each flight of all vehicles and sets, from those of a vehicle."""
+        return jnp.concatenate([x] * (sets * len(vehicles)), axis)
+
+    team = jax.tree.map(lambda *x: jnp.concatenate(x * sets), *(repeat(vehicle, each) for vehicle in vehicles))
+    targets = jax.tree.map(functools.partial(of_all, axis=1), targets)
     step = make_step([drag], rotors=lagging_rotors, dt=1 / hz)
     call = jax.vmap(functools.partial(module.control, dt=1 / hz))
+    gains = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), gains)
 
-    def flown(gains: Any) -> Float[Array, " flights"]:
-        def fly(team: Params, memory: Any, state: State, k: Array) -> tuple[Any, Array]:
-            return call(gains, team, memory, state, jax.tree.map(lambda x: x[k], targets))
+    def fly(team: Params, memory: Any, state: State, k: Array) -> tuple[Any, Array]:
+        return call(gains, team, memory, state, jax.tree.map(lambda x: x[k], targets))
 
-        states = rollout(step, fly, team, start, for_team(module.init(), n), len(targets.yaw))[1]
-        return _error(params, hz, states, targets)
-
-    return n, flown
+    memory = for_team(module.init(), len(team.mass))
+    states = rollout(step, fly, team, jax.tree.map(of_all, start), memory, len(targets.yaw))[1]
+    return _error(params, hz, states, targets).reshape(sets, -1)
 
 
 def _error(params: Params, hz: int, flown: State, targets: Setpoint) -> Float[Array, " flights"]:

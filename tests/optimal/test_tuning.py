@@ -46,9 +46,10 @@ def errors(controller, params, gains):
 
 def of_test_flights(module, params, *gains):
     """The mean errors of the flights by which gains are costs."""
-    flights, flown = tuning._test_flights(module, params, FEW["control_hz"], tuning._EVALUATION_SECONDS)
-    error = jax.jit(lambda each: jnp.mean(flown(each)))
-    return [float(error(jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), one))) for one in gains]
+    sets = jax.tree.map(lambda *x: jnp.repeat(jnp.stack(x)[:, None], tuning._FLIGHTS, axis=1), *gains)
+    hz, seconds = FEW["control_hz"], tuning._EVALUATION_SECONDS
+    errors_of = jax.jit(lambda: tuning._errors_of_flights(module, params, hz, seconds, sets))
+    return jnp.mean(errors_of(), axis=1).tolist()
 
 
 @pytest.mark.slow
@@ -75,11 +76,11 @@ def test_tuned_gains_hover_and_track_better_than_the_controllers_own(controller,
 def test_a_few_iterations_lower_the_error_and_a_second_vehicle_compiles_nothing():
     racer, hb = (jaxdrones.load_params(vehicle) for vehicle in ("racer", "hb"))
     tuned = tune(racer, "rates", **FEW)
-    compiled = tuning._descend._cache_size()
+    compiled = tuning._compiled()._cache_size()
     before, after = of_test_flights(rates, racer, rates.gains(), tuned)
     assert after < before - 0.1
     for_hb = tune(hb, rates, **FEW)  # by its module
-    assert tuning._descend._cache_size() == compiled
+    assert tuning._compiled()._cache_size() == compiled
     assert not np.allclose(for_hb.vel, tuned.vel)
 
 

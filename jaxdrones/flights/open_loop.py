@@ -159,11 +159,11 @@ def _error(predicted: State, logged: State) -> Float[Array, "4"]:
 def _rotor_speed(
     vehicle: Vehicle, command: Array, motors: Motors | None
 ) -> tuple[Float[Array, "rows 4"], Float[Array, "rows 4"]]:
-    """Rotor speeds (RPM) and their rates (RPM/s) in each row of a window, from its start to its end."""
+    """Mean rotor speeds (RPM) and their rates (RPM/s) from each row of a window to the next, from start to end."""
     delay = vehicle.instruments.delay / PERIOD
     if motors is None:
         measured = command[_WARM_UP:]
-        middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF_ROW, -_HALF_ROW))
+        middle, early, late = (_shifted(measured, delay - later)[:_LENGTH] for later in (_HALF_ROW, 0, 1))
         return middle, (late - early) / PERIOD
     delayed = _shifted(command, delay)
     duty, battery, sag = delayed[:, :4], delayed[:, 4:5], delayed[:, 5:]

@@ -21,7 +21,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
 from jaxdrones.flights.fit import Estimate, Report, _estimate
 from jaxdrones.flights.least_squares import standard_errors
-from jaxdrones.flights.open_loop import _shifted, residuals
+from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
 from jaxdrones.flights.parameters import check_guess
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
@@ -80,6 +80,14 @@ def fits(flown):
         fit(logs, start, ("kf",), validate).parameters["kf"]
         for logs, validate in (([log], ()), ([log, log], ()), ([log], [other]))
     ]
+
+
+def test_measured_speeds_are_those_at_the_times_of_the_rows():
+    """In the step from one row to the next a speed that rises by 7 RPM a row is on average that of half a row later."""
+    rows = jnp.arange(93.0)  # the first step begins at row 36: 30 rows of warm-up and 6 of delay
+    speed, rate = _rotor_speed(Vehicle.of(jaxdrones.load_params("cf2x")), jnp.tile(7 * rows[:, None], (1, 4)), None)
+    np.testing.assert_allclose(speed[:, 0], 7 * (36.5 + np.arange(50)), rtol=1e-6)
+    np.testing.assert_allclose(rate, 7 / 0.01, rtol=1e-4)
 
 
 @pytest.mark.parametrize("delay", [-7.0, -0.5, 0.0, 5.8, 6.5, 20.0])

@@ -10,8 +10,8 @@ crazyflow 0.4.0 and rotorpy 3.0.0 in a separate environment (rivals/environment.
             parameters in our model; `cf2x` is that of gym-pybullet-drones. `--vehicle` adds others, for example
             vehicles fitted by `jaxdrones fit`.
   start     The logged state. Rotors have the measured speeds, or have followed the commands of the previous 0.3 s.
-  input     Measured rotor speeds, without lag, each constant for 0.01 s. crazyflow, whose rotors have inertia, receives
-            them linearly interpolated from half a row before to half a row after; jaxdrones receives the same rate.
+  input     Measured rotor speeds, without lag, linearly interpolated from each row to the next: crazyflow, whose rotors
+            have inertia, receives them at 500 Hz; jaxdrones receives their mean and their rate, rotorpy their mean.
             crazyflow limits them to 21,661 RPM. The other simulators do not accept PWM and voltage, so all receive the
             thrust of the firmware's curve of the 2.1+, the others as the rotor speed for it on their own thrust
             curve, and each has its own lag.

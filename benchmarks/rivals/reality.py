@@ -1,8 +1,9 @@
 """crazyflow and rotorpy from every state of flight logs, for benchmarks/reality.py, run in their environment.
 
 For a log with rotor speeds they receive these without their own lag: crazyflow's rotors reach the next speed in one of
-its steps, rotorpy's are set to it in every row. For a log with PWM and voltage they receive, in every row, the speed
-for the firmware's thrust on their own thrust curve, and follow it with their own lag, from 0.3 s before the start on.
+its steps, rotorpy's have the mean speed of a row and the next. For a log with PWM and voltage they receive, in every
+row, the speed for the firmware's thrust on their own thrust curve, and follow it with their own lag, from 0.3 s before
+the start on.
 """
 
 import argparse
@@ -95,9 +96,8 @@ def crazyflow(airframe: str) -> Plant:
 
 
 def subdivided(speeds: np.ndarray) -> np.ndarray:
-    """Speeds (T, 4) of rows as (T, substeps, 4) on the straight line between half a row before and half a row after."""
-    after = np.arange(1, SUBSTEPS + 1) / SUBSTEPS - 0.5
-    rows = np.clip(np.arange(len(speeds))[:, None] + after, 0, len(speeds) - 1)
+    """Speeds (T, 4) of rows as (T, substeps, 4) on the straight line from each row to the next."""
+    rows = np.minimum(np.arange(len(speeds))[:, None] + np.arange(1, SUBSTEPS + 1) / SUBSTEPS, len(speeds) - 1)
     return np.stack([np.interp(rows, np.arange(len(speeds)), motor) for motor in speeds.T], axis=-1)
 
 
@@ -111,7 +111,11 @@ def rotorpy(own: dict) -> Plant:
 
     def fly(log: FlightLog, starts: np.ndarray) -> jd.State:
         n, cpu = len(starts), torch.device("cpu")
-        speeds = RADIANS_PER_SECOND * log.rpm[:, 0] if log.has("rpm") else np.sqrt(thrusts(log) / own["k_eta"])
+        if log.has("rpm"):
+            to_next = np.concatenate([log.rpm[:, 0], log.rpm[-1:, 0]])
+            speeds = RADIANS_PER_SECOND * (to_next[:-1] + to_next[1:]) / 2
+        else:
+            speeds = np.sqrt(thrusts(log) / own["k_eta"])
         rows = starts[:, None] + np.arange(-BEFORE, LENGTH)
         inputs = torch.from_numpy(speeds[np.maximum(rows, 0)][..., ours])
         start = {"x": log.pos, "v": log.vel, "q": log.quat, "w": log.omega}

@@ -23,6 +23,12 @@ def one(team: Any, i: int = 0) -> Any:
 
 
 def team_of(*vehicles: str) -> Params:
+    return _loaded_team(vehicles, bool(jax.config.jax_enable_x64))
+
+
+@lru_cache
+def _loaded_team(vehicles: tuple[str, ...], wide: bool) -> Params:
+    """A team in the precision at hand, loaded once."""
     return jaxdrones.stack([jaxdrones.load_params(vehicle) for vehicle in vehicles])
 
 

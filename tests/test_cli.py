@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import os
 
 import jax
 import numpy as np
@@ -225,6 +226,17 @@ def test_list_names_what_can_be_chosen(capsys):
     assert names["algorithms"] == list(algorithms.ALGORITHMS)
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["list"], ["explain", "hover", "--set", "drones=300"]])
+def test_a_reader_that_ends_early_is_no_error(words, capsys, monkeypatch):
+    """`jaxdrones list | head -1`: output that fits into the buffer, and output that does not."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as pipe:
+        monkeypatch.setattr("sys.stdout", pipe)
+        assert main(words) == 141
+    assert capsys.readouterr().err == ""
 
 
 def test_explain_tells_what_the_numbers_are(capsys):

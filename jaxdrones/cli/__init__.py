@@ -38,7 +38,9 @@ def main(arguments: list[str] | None = None) -> int:
         machine.keep_programs()
         check_options(options)
         with lasting_interrupts():
-            return options.run(options)
+            code = options.run(options)
+            sys.stdout.flush()  # here, not at exit, where an error could not be handled
+            return code
     except BaseException as error:
         return print_failure(error, debug)
 

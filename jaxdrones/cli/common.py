@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import errno
 import os
+import select
 import signal
 import sys
 import threading
@@ -20,13 +21,14 @@ from jaxdrones.cli import machine
 from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
 
-DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
+DIVERGED, MISTAKE, FAULT, INTERRUPTED, PIPE_CLOSED = 1, 2, 70, 130, 141
 EXIT_CODES = """exit codes:
     0  done
     1  diverged flight or training, lost commands, success below `eval --fail-below`, or a problem found by `doctor`
     2  invalid arguments, or an error in your file, with a message of one line
    70  internal error, with its traceback: please report it
-  130  interrupted"""
+  130  interrupted
+  141  stdout was closed, for example by `head`"""
 
 _AGAIN = 0.05  # s after which a lost Ctrl-C is repeated
 _MAX_MESSAGE = 1000  # characters
@@ -80,8 +82,11 @@ def lasting_interrupts():
 def print_failure(error: BaseException, debug: bool) -> int:
     """Write the error of a command to stderr, always with its traceback if `debug`; return the exit code.
 
-    A user's mistake or an error in a user's file is one line. Everything else is an internal error.
+    A user's mistake or an error in a user's file is one line. Everything else is an internal error. Nothing is written
+    if the reader of stdout has ended, as `head` does.
     """
+    if isinstance(error, BrokenPipeError) and _is_stdout_closed():
+        return PIPE_CLOSED
     if debug:
         traceback.print_exception(error)
     in_callback = isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" in str(error)
@@ -97,6 +102,21 @@ def print_failure(error: BaseException, debug: bool) -> int:
         traceback.print_exception(error)
     what = f"{type(error).__name__}: {error}; this is a fault of jaxdrones, please report it"
     return print_error(f"{what} with the lines above and what `jaxdrones doctor` prints", FAULT)
+
+
+def _is_stdout_closed() -> bool:
+    """Whether the reader of stdout has ended; the rest of the output is then discarded."""
+    poll = select.poll()
+    try:
+        poll.register(sys.stdout.fileno(), 0)  # errors alone, which are always reported
+    except OSError:  # stdout is not a file
+        return False
+    if not poll.poll(0):
+        return False
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
+    return True
 
 
 def _explained(error: BaseException) -> str | None:

@@ -1,12 +1,14 @@
 """Write films as MP4 (extra `video`) or GIF."""
 
+import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxdrones.arguments import Count, checked
 from jaxdrones.errors import UserError, install
 from jaxdrones.writing import replaced
 
@@ -31,15 +33,42 @@ def check_video(path: Path, fps: int = 1) -> None:
         raise UserError(f"{error.name} is not installed, so {path} cannot be written; {install('video')}") from None
 
 
-def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
-    """Write RGB frames (height, width, 3) uint8, at least one, as a film; return their number.
+@checked
+def write(frames: Iterable[np.ndarray], path: str | os.PathLike, fps: Count) -> int:
+    """Write RGB frames as a film; return their number.
 
-    The path is one that `check_video` passes.
+    Args:
+        frames: (height, width, 3) uint8 each, at least one; they may be made one after the other by a generator.
+        path: .mp4 or .gif; missing folders are created.
+        fps: frames per second.
 
     Raises:
+        ValueError: frames that are not such arrays, no frame, an unknown suffix, too many frames per second, or a
+            package that is not installed.
         OSError: the file cannot be written.
     """
-    return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)
+    path = Path(path)
+    check_video(path, fps)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(_valid(frames), path, fps)
+
+
+def _valid(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Validated frames."""
+    first = None
+    for k, frame in enumerate(frames):
+        array = np.asarray(frame)
+        if array.ndim != 3 or array.shape[-1] != 3 or 0 in array.shape or array.dtype != np.uint8:
+            example = "(255 * frame).astype(numpy.uint8) for colors from 0 to 1"
+            raise UserError(
+                f"frame {k} is an array {array.shape} of {array.dtype}; give (height, width, 3) of uint8, {example}"
+            )
+        first = first or array.shape
+        if array.shape != first:
+            raise UserError(f"frame {k} has shape {array.shape}, the first {first}; give frames of one size")
+        yield array
+    if first is None:
+        raise UserError("there are no frames; give at least one")
 
 
 def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:

@@ -8,8 +8,9 @@ import pytest
 
 pytest.importorskip("PIL")
 
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Box, Scene
-from jaxdrones.visualization import drawn_film, films, shots
+from jaxdrones.visualization import drawn_film, films, shots, video
 from jaxdrones.visualization.overlay import Lens, Overlay
 from jaxdrones.visualization.palette import as_rgb, colors
 
@@ -148,3 +149,37 @@ def test_frames_that_no_film_can_show_in_time_are_refused(fps, says, record, tmp
     for make in (films.film, films.film_page):
         with pytest.raises(ValueError, match=says):
             make(record, tmp_path / "film.gif", *["title"] * (make is films.film), fps=fps)
+
+
+GRAY = np.full((32, 48, 3), 128, np.uint8)
+
+
+@pytest.mark.needs("imageio_ffmpeg")
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_frames_of_a_script_become_a_film_in_a_new_folder(suffix, tmp_path):
+    path = tmp_path / "new" / f"film{suffix}"
+    assert video.write((GRAY for _ in range(3)), str(path), fps=5) == 3
+    assert path.stat().st_size > 100
+
+
+@pytest.mark.needs("imageio_ffmpeg")
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [
+        ([], "there are no frames"),
+        ([GRAY / 255], r"frame 0 is an array \(32, 48, 3\) of float64; give"),
+        ([GRAY, GRAY[..., 0]], r"frame 1 is an array \(32, 48\) of uint8; give"),
+        ([GRAY, GRAY[1:]], r"frame 1 has shape \(31, 48, 3\), the first \(32, 48, 3\)"),
+    ],
+)
+def test_frames_that_make_no_film_are_refused_and_leave_no_file(frames, says, suffix, tmp_path):
+    with pytest.raises(UserError, match=says):
+        video.write(iter(frames), tmp_path / f"film{suffix}", fps=5)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "fps", "says"), [("a.avi", 5, "films end in"), ("a.gif", 0, "fps is 0")])
+def test_a_film_of_another_format_or_of_no_rate_is_refused(name, fps, says, tmp_path):
+    with pytest.raises(UserError, match=says):
+        video.write([GRAY], tmp_path / name, fps=fps)

@@ -8,6 +8,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones.envs import AutoReset, make
+from jaxdrones.flights import read_log
 from jaxdrones.learning import Result
 from jaxdrones.learning.networks import Policy
 
@@ -42,6 +43,10 @@ LINES = {  # what makes an object, and what is printed of it
     "step": (
         lambda: jd.make_step((jd.drag, two_gusts), (jd.downwash,), jd.lagging_rotors, jd.rk4, dt=0.002, substeps=5),
         "<step: rk4 at 100 Hz x 5, lagging_rotors, effects: drag, two_gusts, pairs: downwash>",
+    ),
+    "log": (
+        lambda: read_log("B10_lissajous_slow_rep1"),
+        "<FlightLog B10_lissajous_slow_rep1.npz: 1 drone, ",
     ),
     "plain step": (
         jd.make_step,

@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxdrones import assets
 from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError
+from jaxdrones.flights.bag import read_bag
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog, ImageSequence, LoggedConditions
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -67,7 +68,7 @@ def read_log(path: str | os.PathLike) -> FlightLog:
         ImportError: a bag without rosbags.
     """
     file = find_log(path)
-    arrays = _bag(file) if file.is_dir() else _csv(file) if file.suffix == ".csv" else _npz(file)
+    arrays = read_bag(file) if file.is_dir() else _csv(file) if file.suffix == ".csv" else _npz(file)
     for alias, name in _ALIASES.items():
         if alias in arrays:
             arrays.setdefault(name, arrays.pop(alias))
@@ -156,7 +157,7 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:  # spreadsheets write a mark of the byte order
             reader = csv.DictReader(lines)
-            names = reader.fieldnames or ()
+            reader.fieldnames = names = [name.strip() for name in reader.fieldnames or ()]
             table: dict[str, list[str]] = {name: [] for name in names}
             if len(table) < len(names):
                 raise UserError("two columns have the same name")
@@ -167,6 +168,8 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
                     raise UserError(f"line {reader.line_num} has not {len(names)} entries, one for each column")
                 for name, entries in table.items():
                     entries.append(row[name])
+        if not any(table.values()):
+            raise UserError("it has no rows below the names of the columns")
         drones = table.pop("drone", ["drone 0"])
         labels = list(dict.fromkeys(drones))
         read = {name: [_number(name, line, x) for line, x in enumerate(table[name], 2)] for name in table}
@@ -174,12 +177,20 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
     except (*_DAMAGE, TypeError, csv.Error) as error:
         raise UserError(f"{file}: is not a table of numbers ({error}); give the log of a flight") from None
     t = numbers.pop("t", np.zeros((0, 1)))
-    if drones != labels * (len(drones) // max(len(labels), 1)) or (t != t[:, :1]).any():
+    same_time = (t == t[:, :1]) | np.isnan(t).any(axis=1, keepdims=True)  # `_check` names a time that is not finite
+    if drones != labels * (len(drones) // max(len(labels), 1)) or not same_time.all():
         raise UserError(f"{file.name}: has other drones at some times; give one row for each time and drone, in order")
-    arrays = {"t": t[:, 0]} if len(t) else {}
+    arrays = {"t": t.max(axis=1)} if len(t) else {}
     for name in (*_WIDTHS, *_ALIASES):
         axes = [f"{name}_{axis}".rstrip("_") for axis in _AXES.get(_ALIASES.get(name, name), "xyz")]
-        if all(axis in numbers for axis in axes):
+        missing = [axis for axis in axes if axis not in numbers]
+        if 0 < len(missing) < len(axes):
+            meaning = _MEANINGS[_ALIASES.get(name, name)]
+            raise UserError(
+                f"{file.name}: has only some columns of {name!r} ({meaning}); {', '.join(missing)} "
+                f"{'is' if len(missing) == 1 else 'are'} missing"
+            )
+        if not missing:
             stacked = np.stack([numbers[axis] for axis in axes], axis=-1)
             arrays[name] = stacked if len(axes) > 1 else stacked[..., 0]
     return arrays | {"labels": np.array(labels)}
@@ -190,53 +201,6 @@ def _number(column: str, line: int, entry: str) -> float:
         return float(entry)
     except ValueError:
         raise UserError(f"column {column!r} has {entry[:30]!r} in line {line}") from None
-
-
-def _bag(path: Path) -> dict[str, np.ndarray]:
-    """Arrays of a bag: poses and twists of /drone_0/odom, ... and rotor speeds of /drone_0/motors, ..."""
-    try:
-        from rosbags.rosbag2 import Reader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
-    store = get_typestore(Stores.ROS2_JAZZY)
-    found: dict[str, dict[int, Any]] = {}
-    kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}
-    try:
-        with Reader(path) as reader:
-            wanted = [c for c in reader.connections if c.topic.endswith(f"/{kinds.get(c.msgtype, '?')}")]
-            for connection, ns, data in reader.messages(wanted):
-                message = store.deserialize_cdr(data, connection.msgtype)
-                found.setdefault(connection.topic.strip("/"), {})[ns] = message
-    except Exception as error:  # the reader raises errors of any type on damaged bytes
-        raise UserError(f"{path} is not a ROS 2 bag, or is damaged: {error}; give the folder of a bag") from None
-    n = 0
-    while {f"drone_{n}/odom", f"drone_{n}/motors"} <= found.keys():
-        n += 1
-    if not n:
-        raise UserError(f"{path} has no flight: /drone_0/odom or /drone_0/motors is missing; record both")
-    times = sorted(set.intersection(*(set(found[f"drone_{i}/{kind}"]) for i in range(n) for kind in kinds.values())))
-    if not times:
-        raise UserError(f"{path}: /odom and /motors of its {n} drones have no time in common; record equal times")
-    motors = [[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]
-    if any(len(speeds) != _WIDTHS["rpm"] for team in motors for speeds in team):
-        raise UserError(f"{path}: a message of /motors does not have 4 numbers; record the rotor speeds, RPM")
-    odometry = [[found[f"drone_{i}/odom"][ns] for i in range(n)] for ns in times]
-
-    def stacked(part: str, kind: str, axes: str) -> np.ndarray:
-        values = [[getattr(getattr(getattr(m, part), part), kind) for m in team] for team in odometry]
-        return np.array([[[getattr(v, axis) for axis in axes] for v in team] for team in values])
-
-    quat, body_vel = stacked("pose", "orientation", "xyzw"), stacked("twist", "linear", "xyz")
-    turned = 2 * np.cross(quat[..., :3], body_vel)  # R v = v + w t + u x t with t = 2 u x v and q = (u, w)
-    return {
-        "t": np.array(times) / 1e9,
-        "pos": stacked("pose", "position", "xyz"),
-        "quat": quat,
-        "vel": body_vel + quat[..., 3:] * turned + np.cross(quat[..., :3], turned),
-        "omega": stacked("twist", "angular", "xyz"),
-        "rpm": np.array(motors),
-    }
 
 
 def _columns(name: str, arrays: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -124,6 +124,11 @@ class FlightLog:
         if self.params is None:
             object.__setattr__(self, "params", repeat(load_params("cf2x"), drones))
 
+    def __repr__(self) -> str:
+        n, times = len(self.labels), f"{self.t[0]:g} to {self.t[-1]:g} s" if len(self.t) else "empty"
+        columns = ", ".join((*STATE, *filter(self.has, OPTIONAL)))
+        return f"<FlightLog {self.name}: {n} drone{'s' * (n != 1)}, {len(self.t)} rows, {times}, with {columns}>"
+
     def has(self, *names: str) -> bool:
         """Whether the log has all of these optional arrays."""
         return all(bool(np.isfinite(getattr(self, name)).any()) for name in names)

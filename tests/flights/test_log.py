@@ -184,6 +184,30 @@ def test_a_table_whose_lines_or_columns_do_not_fit_is_refused(columns, tmp_path)
             read_log(tmp_path / f"{name}.csv")
 
 
+def test_blanks_beside_the_commas_of_a_table_do_not_matter(columns, tmp_path):
+    log = written(tmp_path, columns)
+    save_csv(log, tmp_path / "flight.csv")
+    (tmp_path / "blanks.csv").write_text((tmp_path / "flight.csv").read_text().replace(",", " , "))
+    np.testing.assert_allclose(read_log(tmp_path / "blanks.csv").pos, log.pos, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda rows: [], "it has no rows"),
+        (lambda rows: rows[:1], "it has no rows"),
+        (lambda rows: [rows[0].replace("quat_x", "qx"), *rows[1:]], r"some columns of 'quat' .*; quat_x is missing"),
+        (lambda rows: [rows[0].replace("rpm_0", "rpm_4"), *rows[1:]], r"some columns of 'rpm' .*; rpm_0 is missing"),
+        (lambda rows: [*rows[:4], "nan," + rows[4].partition(",")[2], *rows[5:]], "goes from .* to nan s in row 3"),
+    ],
+)
+def test_a_table_that_lacks_rows_columns_or_times_is_refused(change, says, columns, tmp_path):
+    save_csv(written(tmp_path, columns), tmp_path / "flight.csv")
+    (tmp_path / "flight.csv").write_text("\n".join(change((tmp_path / "flight.csv").read_text().splitlines())))
+    with pytest.raises(ValueError, match=says):
+        read_log(tmp_path / "flight.csv")
+
+
 def test_a_name_of_a_single_drone_is_its_label(columns, tmp_path):
     np.savez(tmp_path / "flight.npz", **columns, labels=np.asarray("scout"))
     assert read_log(tmp_path / "flight.npz").labels == ("scout",)

@@ -6,6 +6,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.urdf import GRAVITY, PROPERTIES
 
@@ -17,6 +18,7 @@ def to_urdf(params: Params, name: str, comment: str = "") -> str:
 
     The comment at the top is made valid for XML. Gravity, air, wind, forces and constants in `aux` are not written.
     """
+    check_shape("params.mass", params.mass, (), "to_urdf writes a single drone")
     comment, name = re.sub("-(?=-)", "- ", _INVALID.sub("", comment)), _INVALID.sub("", name)
     thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)
     derived = {"thrust2weight": thrust2weight, "max_speed_kmh": params.max_speed * 3.6}

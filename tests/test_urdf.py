@@ -11,6 +11,7 @@ from helpers import VEHICLES, assert_close, assert_finite
 
 import jaxdrones
 from jaxdrones import assets
+from jaxdrones.urdf_writer import to_urdf
 
 RTOL = 1e-12
 
@@ -91,6 +92,11 @@ def test_a_folder_of_a_fit_names_the_vehicle_in_it(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"vehicle is the folder 'fit'; give the file, 'fit/vehicle\.urdf'"):
         jaxdrones.load_params("fit")
     assert jaxdrones.load_params("cf2x")  # a name of a bundled vehicle comes first
+
+
+def test_a_team_is_no_vehicle_to_write():
+    with pytest.raises(ValueError, match=r"params.mass has shape \(2,\); expected \(\): to_urdf writes a single drone"):
+        to_urdf(jaxdrones.repeat(jaxdrones.load_params("cf2x"), 2), "team")
 
 
 def test_a_missing_file_says_what_to_give(tmp_path):

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.chunks import ChunkedProgram
 from jaxdrones.accelerate.fitting import NoKernelError
-from jaxdrones.checks import check_whole
+from jaxdrones.checks import check_sequence, check_whole
 from jaxdrones.errors import UserError
 
 _TRACER = jax.core.Tracer
@@ -73,7 +73,8 @@ class _ManyWorlds:
     def __init__(
         self, function: Callable, chunk: int | None, in_axes: int | Sequence[int], devices: Sequence[jax.Device]
     ):
-        self._function, self._chunk, self._in_axes, self._devices = function, chunk, in_axes, tuple(devices)
+        self._function, self._chunk, self._in_axes = function, chunk, in_axes
+        self._devices = check_sequence("devices", devices, "*jax.devices()")
         self._several_kernels = jax.jit(functools.partial(self._evaluated, kernel=False))
         self._without_kernel: set[Any] = set()  # shapes of arguments without a single kernel
 

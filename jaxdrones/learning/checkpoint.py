@@ -39,7 +39,7 @@ def load(path: str | os.PathLike, network: Any = None) -> Policy:
 
     Raises:
         FileNotFoundError: there is no checkpoint.
-        ValueError: damaged or mismatched files, or a precision that is disabled in JAX.
+        ValueError: damaged or mismatched files, a network of another class, or a precision that is disabled in JAX.
     """
     path = Path(path)
     sidecar = read_sidecar(path)
@@ -53,9 +53,15 @@ def load(path: str | os.PathLike, network: Any = None) -> Policy:
         if "own" in settings:
             if network is None:
                 raise UserError(f"{path} holds a network of your own, {settings['own']}; give load(path, network=...)")
+            if _class_name(network) != settings["own"].rpartition(".")[2]:
+                raise UserError(
+                    f"{path} holds a network of class {settings['own']}, not {_class_name(network)}; give one"
+                )
             network = OwnNetwork(network, settings["output_size"])
             params = network.restored(params, len(obs_stats.mean), sidecar["policy"]["per_agent"])
         else:
+            if network is not None:
+                raise UserError(f"{path} holds a built-in network, not {_class_name(network)}; give load(path)")
             network = Network(**settings) if "recurrent_size" in settings else MLP(**settings)
         policy = Policy(params, obs_stats, network, sidecar["policy"]["per_agent"])
     except (AttributeError, KeyError, TypeError) as error:
@@ -97,6 +103,10 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
         return jax.random.wrap_key_data(x, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
 
     return jax.tree.map(restored, arrays, like)
+
+
+def _class_name(network: Any) -> str:
+    return type(network).__name__
 
 
 def _settings(network: MLP | Network | OwnNetwork) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
+from jaxdrones.learning.settings import check_environment
 from jaxdrones.limits import check_memory
 from jaxdrones.pytree import PyTreeNode
 
@@ -69,6 +70,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: Count = 1000) -> R
     Raises:
         ValueError: no random key, or more episodes than fit in memory.
     """
+    check_environment(env)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, PyTreeNode):

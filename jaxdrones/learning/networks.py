@@ -132,6 +132,11 @@ class Policy(PyTreeNode):
 
     def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
         """Hidden state (*batch, n, ...) after the observations, which may have images, and actions in (-1, 1)."""
+        size, wanted = state_vector(obs).shape[-1], len(self.obs_stats.mean)
+        if size != wanted:
+            raise UserError(
+                f"obs has {size} entries for each drone, and the policy takes {wanted}; give those of its task"
+            )
         x = map_state_vector(self.obs_stats.normalize, obs)
         hidden_state, output = apply(self.network, self.params, x, self.per_agent, hidden_state)
         return hidden_state, jnp.tanh(output)

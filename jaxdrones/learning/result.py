@@ -19,7 +19,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.metrics import with_unknown, without_unknown
 from jaxdrones.learning.networks import OwnNetwork, Policy
-from jaxdrones.learning.settings import Config, check_config
+from jaxdrones.learning.settings import Config, check_config, check_environment
 from jaxdrones.pytree import PyTreeNode
 
 MAX_CALL = 64
@@ -130,6 +130,7 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised;
                 see `history["nonfinite_gradients"]`.
         """
+        check_environment(env)
         check_config(config, kind)
         callbacks = (callback,) if callable(callback) else tuple(callback or ())
         if not all(map(callable, callbacks)):

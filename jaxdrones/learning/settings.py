@@ -48,5 +48,11 @@ def check_config(config: Any, kind: type) -> None:
     raise UserError(f"config is {given}; give jaxdrones.learning.{learner}.Config(...)")
 
 
+def check_environment(env: Any) -> None:
+    """Raise for the name of a task in place of an environment."""
+    if isinstance(env, str):
+        raise UserError(f"env is {env!r}; give an environment, for example jaxdrones.make({env!r})")
+
+
 def _learner(kind: type) -> str:
     return kind.__module__.rpartition(".")[2]

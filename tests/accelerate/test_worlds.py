@@ -60,6 +60,11 @@ def test_arguments_that_do_not_fit_are_named(in_axes, count, says):
         jd.over_worlds(fly, in_axes=in_axes)(starts, commands[:count])
 
 
+def test_a_number_of_devices_is_no_device():
+    with pytest.raises(ValueError, match=r"devices is 2; give a sequence, for example \(\*jax.devices\(\),\)"):
+        jd.over_worlds(fly, devices=2)
+
+
 def test_a_number_for_all_worlds_is_no_argument():
     with pytest.raises(ValueError, match="no axis 0 over worlds"):
         jd.over_worlds(lambda start, gain: fly(start, commands[0] * gain))(starts, 1.01)

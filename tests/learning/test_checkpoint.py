@@ -1,3 +1,4 @@
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,6 +53,13 @@ def test_training_goes_on_bit_for_bit(tmp_path):
         if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
             a, b = jax.random.key_data(a), jax.random.key_data(b)
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_network_beside_a_built_in_one_is_refused(env, tmp_path):
+    """It was ignored."""
+    checkpoint.save(tmp_path / "policy", Policy.init(jax.random.key(0), env, (8,)))
+    with pytest.raises(ValueError, match=r"holds a built-in network, not Dense; give load\(path\)"):
+        checkpoint.load(tmp_path / "policy", network=nn.Dense(4))
 
 
 @pytest.mark.slow

@@ -23,6 +23,12 @@ def test_a_new_policy_hovers(team):
     assert jnp.max(jnp.abs(action)) < 0.1
 
 
+def test_observations_of_another_size_are_refused(team):
+    policy = Policy.init(jax.random.key(0), team, (4,))
+    with pytest.raises(ValueError, match="obs has 11 entries for each drone, and the policy takes 12"):
+        policy(jnp.ones((2, 11)))
+
+
 @pytest.mark.slow
 def test_actions_are_bounded(team):
     policy = Policy.init(jax.random.key(0), team, (16,))

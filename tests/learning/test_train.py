@@ -16,7 +16,7 @@ from double_integrator import SMALL, Cue, DoubleIntegrator
 from flax import nnx
 from helpers import jit_unoptimized, mostly_slow, name_of
 
-from jaxdrones.learning import bptt, checkpoint, loggers, ppo, result
+from jaxdrones.learning import bptt, checkpoint, evaluate, loggers, ppo, result
 from jaxdrones.learning.networks import MLP, OwnNetwork, Policy
 
 KEY = jax.random.key(0)
@@ -274,6 +274,14 @@ def test_a_state_that_does_not_fit_is_refused():
             bptt.train(KEY, env, dataclasses.replace(config, **change), state=wrong)
 
 
+def test_the_name_of_a_task_is_no_environment():
+    says = r"env is 'hover'; give an environment, for example jaxdrones.make\('hover'\)"
+    with pytest.raises(ValueError, match=says):
+        bptt.train(KEY, "hover", SMALL[bptt])
+    with pytest.raises(ValueError, match=says):
+        evaluate("hover", lambda obs: obs, KEY)
+
+
 def test_a_callback_that_is_no_function_is_refused():
     with pytest.raises(ValueError, match=r"callback: <lambda> takes .*; give a function of \(update, metrics, state\)"):
         bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], callback=lambda update, metrics: None)
@@ -323,6 +331,8 @@ def test_a_policy_is_not_loaded_into_a_network_of_other_arrays(tmp_path):
     policy = Policy.init(KEY, DoubleIntegrator(), network=network(*SIZES), per_agent=True)
     checkpoint.save(tmp_path / "policy", policy)
     assert checkpoint.load(tmp_path / "policy", network(*SIZES)).per_agent
+    with pytest.raises(ValueError, match="holds a network of class NnxNetwork, not Linear; give one"):
+        checkpoint.load(tmp_path / "policy", nnx.Linear(*SIZES[:2], rngs=nnx.Rngs(0)))
     for sizes in (2, 8), (2, 4, 1), (2, 8, 8, 1):
         with pytest.raises(ValueError, match=r"network has array \[\d\] of shape .*, the policy .*; give its network"):
             checkpoint.load(tmp_path / "policy", network(*sizes))

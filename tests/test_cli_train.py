@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from helpers import SMALL_OPTIONS
 
-from jaxdrones.cli import main
+from jaxdrones.cli import main, make_parser
 from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
-from jaxdrones.cli.settings import with_config
+from jaxdrones.cli.settings import parse_settings, with_config
 from jaxdrones.cli.train_request import Request
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
@@ -324,21 +324,49 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     assert "hover by shac" in capsys.readouterr().out
 
 
+def configured(*words):
+    """Words of a command line with those of its --config file."""
+    return with_config(list(words), make_parser().commands["train"])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("budgt = 3", "unknown option in --config options.toml: 'budgt'; did you mean 'budget'? (known: algo, "),
+        ("seeds = true", "--config options.toml: seeds is true; give its value"),
+        ("task = 3", "--config options.toml: task is 3; give a name in quotation marks"),
+        ("task = ['hover']", "--config options.toml: task is ['hover']; give a name"),
+    ],
+)
+def test_a_wrong_entry_of_a_file_of_options_is_named_with_the_file(content, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("options.toml").write_text(content)
+    assert main(["train", "--config", "options.toml"]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+
+
+def test_names_of_a_setting_are_separated_by_commas():
+    for text in ("omega,gravity", "omega,gravity,", "('omega', 'gravity')", "['omega', 'gravity']"):
+        assert tuple(parse_settings([f"observation={text}"])["observation"]) == ("omega", "gravity")
+    assert parse_settings(["effects=drag", "action=rpm"]) == {"effects": ("drag",), "action": "rpm"}
+
+
 def test_a_file_of_options_is_read_however_it_is_given(tmp_path):
     file = tmp_path / "options.toml"
     file.write_text("seeds = 3\n[set]\nhidden_sizes = [8]\n[sweep]\nhorizon = 5\ngamma = [0.9, 0.99]\n")
     read = ["train", "hover", "--seeds=3", "--set=hidden_sizes=[8]", "--sweep=horizon=5", "--sweep=gamma=0.9,0.99"]
     for words in (["--config", str(file)], [f"--config={file}"]):
-        assert with_config(["train", "hover", *words]) == read
+        assert configured("train", "hover", *words) == read
 
 
 def test_a_task_of_the_command_line_overrides_that_of_a_file(tmp_path):
     file = tmp_path / "options.toml"
     file.write_text('task = "hover"\nseeds = 2\n')
-    assert with_config(["train", "--config", str(file)]) == ["train", "hover", "--seeds=2"]
-    assert with_config(["train", "--from", "hover", "--config", str(file)])[:2] == ["train", "hover"]
+    assert configured("train", "--config", str(file)) == ["train", "hover", "--seeds=2"]
+    assert configured("train", "--from", "hover", "--config", str(file))[:2] == ["train", "hover"]
     for words in ["tracking", "--seed", "1"], ["--seed", "1", "tracking"], ["--seed=1", "tracking"]:
-        read = with_config(["train", *words, "--config", str(file)])
+        read = configured("train", *words, "--config", str(file))
         assert read.count("tracking") == 1 and "hover" not in read and "--seeds=2" in read
 
 
@@ -368,6 +396,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--sweep", "horizon=2", "--sweep", "horizon=3"], "--sweep horizon is given twice"),
         (["train", "hover", "--sweep", "gamma=0.9,0.99,0.90"], "--sweep has gamma=0.9 twice"),
         (["train", "hover", "--sweep", "gamma=0.9,2"], "gamma is 2.0; give a number of at least 0 and at most 1"),
+        (["train", "hover", "--sweep", "worlds=8,many"], "worlds is 'many'; give something like 256"),
         (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config=none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config", "none.toml", "--config=none.toml"], "--config is given twice"),

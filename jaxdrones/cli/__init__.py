@@ -31,9 +31,10 @@ from jaxdrones.cli.settings import task_first, with_config
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code, see `EXIT_CODES`."""
     gc.set_threshold(50_000)  # tracing makes many objects and little garbage
-    parser, debug = _parser(), False
+    parser, debug = make_parser(), False
     try:
-        options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))
+        arguments = with_config(sys.argv[1:] if arguments is None else arguments, parser.commands["train"])
+        options = parser.parse_args(task_first(arguments))
         debug = options.debug
         machine.keep_programs()
         check_options(options)
@@ -45,7 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
         return print_failure(error, debug)
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> Parser:
+    """Parser of the command line."""
     parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.")
     text = "show the traceback of every error"
     parser.add_argument("--debug", action="store_true", help=text)
@@ -58,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     for each in commands.choices.values():
         each.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     completion.add(commands, parser)
+    parser.commands = commands.choices
     for each in commands.choices.values():  # --debug may stand before the command or after it
         each.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=text)
     return parser

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ _DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
 
 class Parser(argparse.ArgumentParser):
     """Parser without abbreviations, with error messages of one line, and exit codes in its help."""
+
+    commands: Mapping[str, argparse.ArgumentParser]
+    """Parser of each command, by name."""
 
     def __init__(self, **kwargs):
         super().__init__(**{"allow_abbrev": False} | kwargs)

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.checks import check_choice
 from jaxdrones.cli.options import option
 from jaxdrones.envs import TASKS
 from jaxdrones.envs.named_tasks import task_function
@@ -17,6 +18,8 @@ from jaxdrones.user_code import blame, is_reference
 
 # Arguments of `Recipe.of` with their own options.
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic")
+# Settings that are sequences of names, separated by commas at the shell.
+_NAMES = ("observation", "vision", "effects", "pairs")
 
 
 def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
@@ -49,8 +52,11 @@ def task_first(arguments: list[str]) -> list[str]:
     return arguments
 
 
-def with_config(arguments: list[str]) -> list[str]:
-    """Insert the options of `train --config FILE`; options of the command line override them."""
+def with_config(arguments: list[str], train: argparse.ArgumentParser) -> list[str]:
+    """Insert the options of `train --config FILE`; options of the command line override them.
+
+    `train` is the parser of that command.
+    """
     arguments = [x for word in arguments for x in (word.split("=", 1) if word.startswith("--config=") else [word])]
     command = next((i for i, word in enumerate(arguments) if not word.startswith("-")), None)
     if command is None or arguments[command] != "train" or "--config" not in arguments[:-1]:
@@ -64,6 +70,9 @@ def with_config(arguments: list[str]) -> list[str]:
     except (OSError, ValueError) as error:
         raise UserError(f"--config {file} cannot be read: {error}") from None
     task = [entries.pop("task")] if "task" in entries else []
+    if not all(isinstance(x, str) for x in task):
+        raise UserError(f"--config {file}: task is {task[0]!r}; give a name in quotation marks")
+    _check_entries(file, entries, train)
     if any(_is_positional(words) for words in itertools.pairwise(rest[command:])):
         task = []
     options = []
@@ -76,6 +85,15 @@ def with_config(arguments: list[str]) -> list[str]:
             options.append(f"--{name}" if x is True else f"--{name}={x}")
     first = next((k for k in range(command + 1, len(rest)) if rest[k].startswith("-")), len(rest))
     return [*rest[:first], *task, *options, *rest[first:]]
+
+
+def _check_entries(file: Path, entries: dict[str, Any], train: argparse.ArgumentParser) -> None:
+    """Raise unless the entries of a file are options of the command, and true only those without a value."""
+    options = {word[2:]: action for action in train._actions for word in action.option_strings if word[:2] == "--"}
+    for name, x in entries.items():
+        check_choice(f"option in --config {file}:", name, options.keys() - {"help", "config"})
+        if x is True and options[name].nargs is None:
+            raise UserError(f"--config {file}: {name} is true; give its value")
 
 
 def _is_positional(words: tuple[str, str]) -> bool:
@@ -95,7 +113,9 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
             raise UserError(
                 f"--set {name} is not a setting of a learner or of an environment; see jaxdrones train --help"
             )
-        changes[name] = _value(value)
+        changes[name] = parse_value(value)
+        if name in _NAMES and isinstance(changes[name], str):
+            changes[name] = tuple(value.removesuffix(",").split(","))
     return changes
 
 
@@ -109,7 +129,7 @@ def given_settings(options: argparse.Namespace) -> dict[str, Any]:
     return changes | given
 
 
-def _value(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """Python literal, or else a string; `nan` and `inf` are numbers."""
     try:
         return ast.literal_eval(text)

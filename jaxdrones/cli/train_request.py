@@ -11,7 +11,7 @@ from typing import Any, Self
 from jaxdrones import arguments
 from jaxdrones.cli.common import run_folder
 from jaxdrones.cli.policies import is_user_policy, open_policy, warn_of_code
-from jaxdrones.cli.settings import given_settings
+from jaxdrones.cli.settings import given_settings, parse_value
 from jaxdrones.errors import UserError
 from jaxdrones.learning.loggers import logger_names
 from jaxdrones.learning.networks import Policy
@@ -167,7 +167,7 @@ def parse_sweep(text: str) -> tuple[str, list[Any]]:
     try:
         parsed = list(ast.literal_eval(f"[{values}]"))
     except (ValueError, SyntaxError):
-        parsed = values.split(",")
+        parsed = [parse_value(value) for value in values.split(",")]
     if not name or not parsed or "" in parsed:
         raise UserError(f"--sweep is {text!r}; give NAME=VALUE,VALUE, for example learning_rate=1e-3,3e-3")
     return name, parsed

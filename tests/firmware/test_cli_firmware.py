@@ -15,7 +15,7 @@ import pytest
 from documents import ROOT, blocks
 
 import jaxdrones as jd
-from jaxdrones.cli import _parser, main
+from jaxdrones.cli import main, make_parser
 from jaxdrones.cli.betaflight import errors_of
 from jaxdrones.firmware.betaflight import Sticks
 from jaxdrones.firmware.betaflight.joystick import Joystick
@@ -152,7 +152,7 @@ def test_every_command_of_the_page_is_a_command():
     commands = [re.sub(r"\s+#.*", "", line).split()[1:] for line in lines if line.startswith("jaxdrones ")]
     assert {arguments[0] for arguments in commands} >= {"betaflight", "crazyflie"}
     for arguments in commands:
-        _parser().parse_args(arguments)
+        make_parser().parse_args(arguments)
 
 
 def test_the_errors_of_a_flight_are_those_of_the_rows_with_a_target():

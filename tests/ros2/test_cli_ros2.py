@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from in_process import InProcess, Wire
 
-from jaxdrones.cli import _parser, main
+from jaxdrones.cli import main, make_parser
 
 FILES = Path(__file__).parents[2] / "ros2"
 
@@ -92,4 +92,4 @@ def test_the_launch_file_starts_a_command_that_exists():
         command = command.replace(f"$(var {name})", default)
     assert "$(" not in command
     program, *arguments = shlex.split(command)
-    assert program == "jaxdrones" and _parser().parse_args(arguments).drones == int(defaults["drones"])
+    assert program == "jaxdrones" and make_parser().parse_args(arguments).drones == int(defaults["drones"])

@@ -11,6 +11,7 @@ import pytest
 from helpers import mostly_slow
 
 from jaxdrones.cli import main
+from jaxdrones.cli.flight_options import warn
 from jaxdrones.cli.report import listed, summary, table
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.fly import fly
@@ -21,11 +22,12 @@ SHORT = ["--duration", "0.25", "--drones", "2"]
 
 
 def test_fly_prints_a_table_and_writes_log_and_figure(tmp_path, capsys):
+    (tmp_path / "log.csv").touch()  # of an earlier flight, which is replaced
     assert main(["fly", "circle", *SHORT, "--output", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "circle: 2 x cf2x, pid at 120 Hz, semi_implicit_euler at 240 Hz" in out
     assert "rms (m)" in out and "drone 1" in out
-    assert (tmp_path / "flight.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "flight.png").read_bytes().startswith(b"\x89PNG") and not (tmp_path / "log.csv").exists()
     log = np.load(tmp_path / "log.npz")
     assert log["pos"].shape == (30, 2, 3) and log["rpm"].shape == (30, 2, 4)
     assert json.loads(str(log["conditions"]))["control_hz"] == 120
@@ -66,6 +68,7 @@ def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_csv_and_pwm_come_on_request(tmp_path):
+    (tmp_path / "flight.png").touch()  # of an earlier flight
     assert main(["fly", "circle", *SHORT, "--csv", "--pwm", "--no-figure", "--output", str(tmp_path)]) == 0
     log = np.load(tmp_path / "log.npz")
     np.testing.assert_allclose(0.2685 * log["pwm"] + 4070.3, log["rpm"], rtol=1e-6)
@@ -75,6 +78,22 @@ def test_csv_and_pwm_come_on_request(tmp_path):
     assert float(rows[-1]["pos_z"]) == pytest.approx(log["pos"][-1, 1, 2])
     assert float(rows[-1]["pwm_3"]) == pytest.approx(log["pwm"][-1, 1, 3])
     assert not (tmp_path / "flight.png").exists()
+
+
+def test_a_flight_of_several_that_diverges_is_named(capsys):
+    assert (warn({}, "pid"), warn({"drone 0": "drone 0 is upside down"}, "pid")) == (0, 1)
+    assert "the flight of pid diverged: drone 0 is upside down" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_every_controller_whose_flight_diverges_is_named(tmp_path, capsys):
+    own = "def gains():\n    pass\ndef init():\n    pass\ndef control(gains, params, memory, state, setpoint, dt):\n"
+    for name in ("first", "second"):
+        (tmp_path / f"{name}.py").write_text(f"{own}    return memory, float('nan') * state.rpm\n")
+    names = f"{tmp_path}/first.py,pid,{tmp_path}/second.py"
+    assert main(["compare", "circle", "--duration", "0.1", "--drones", "1", "--controllers", names]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "the flight of first diverged: the state of drone 0" in first and "the flight of second diverged" in second
 
 
 def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypatch):

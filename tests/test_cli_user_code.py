@@ -13,6 +13,7 @@ from jaxdrones import assets
 from jaxdrones.cli import main
 from jaxdrones.cli.train_output import warn_of_failure
 from jaxdrones.envs import TASKS
+from jaxdrones.learning.evaluation import Report
 from jaxdrones.training import trainer
 from jaxdrones.training.presets import default_algorithm, settings_known
 from jaxdrones.training.run import Run
@@ -146,6 +147,16 @@ def test_a_user_policy_of_a_wrong_shape_is_refused(here, capsys):
     assert main(["eval", "my_policy.py:policy", "--task", "hover", "--episodes", "2"]) == 2
     said = capsys.readouterr().err
     assert "my_policy.py:policy returns an array (1, 2) of float32; return actions of shape (1, 4)" in said
+
+
+def test_an_evaluation_that_is_not_finite_fails(here, capsys, monkeypatch):
+    nan = float("nan")
+    errors, metrics = dict.fromkeys((50, 95, 99), nan), {"error": nan, "speed": nan}
+    report = Report(2, 2, 0.0, (0.0, 0.66), nan, errors, nan, nan, 0.01, {"lost": 1.0}, metrics)
+    monkeypatch.setattr("jaxdrones.cli.evaluate.evaluate", lambda *_: report)
+    Path("my_policy.py").write_text("def policy(obs):\n    return obs[:, :4] * float('nan')\n")
+    assert main(["eval", "my_policy.py:policy", "--task", "hover"]) == 1
+    assert "the mean return is not finite" in capsys.readouterr().err
 
 
 @pytest.mark.slow

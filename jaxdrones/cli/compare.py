@@ -69,7 +69,7 @@ def _compare(options: argparse.Namespace) -> int:
         text = f"{table(found['results'])}\n{results.definitions(next(iter(records.values())), settling_time)}"
     wrote = "wrote " + ", ".join(about["files"]) if files else None
     print_results(options, about | found, f"{options.flight}: {headline}", text, wrote)
-    return warn(next(filter(None, diverged.values()), {}))
+    return max(warn(drones, name) for name, drones in diverged.items())
 
 
 def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.Namespace, str]]]:

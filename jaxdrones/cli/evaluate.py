@@ -1,6 +1,7 @@
 """`jaxdrones eval`."""
 
 import argparse
+import math
 from typing import Any
 
 import jax
@@ -52,6 +53,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     if options.fail_below is not None and report["success"] is None:
         raise UserError(f"--fail-below {options.fail_below} is given, and the task has no criterion of success")
     print_results(options, about | {"recipe": recipe.as_dict(), "evaluation": report}, title, evaluation_table(report))
+    if not math.isfinite(report["mean_return"]):
+        what = "the mean return is not finite, so actions, states or rewards are not"
+        return print_error(f"{what}; call the policy with an observation, and test the task by check_env", DIVERGED)
     if options.fail_below is not None and report["success"] < options.fail_below:
         rate = percent(report["success"], options.episodes)
         return print_error(f"the success rate is {rate}, below --fail-below {options.fail_below:g}", DIVERGED)

@@ -60,12 +60,13 @@ def _conditions(options: argparse.Namespace) -> dict[str, Any]:
     return given | {"effects": effects}
 
 
-def warn(diverged: dict[str, str]) -> int:
-    """Write a warning for a diverged flight to stderr; return the exit code."""
+def warn(diverged: dict[str, str], name: str = "") -> int:
+    """Write a warning for a diverged flight, one of several with a name, to stderr; return the exit code."""
     if not diverged:
         return 0
     others = f" (and {len(diverged) - 1} more)" if len(diverged) > 1 else ""
-    what = f"the flight diverged: {next(iter(diverged.values()))}{others}"
+    flight = f"the flight of {name}" if name else "the flight"
+    what = f"{flight} diverged: {next(iter(diverged.values()))}{others}"
     return print_error(f"{what}; try a higher --control-hz, another --controller, or fewer --effects", 1)
 
 

@@ -198,6 +198,9 @@ def _write(
 ) -> list[Path]:
     files = [output / "log.npz"]
     save_npz(record, files[0], options.pwm)
+    for name, is_requested in (("log.csv", options.csv), ("flight.png", not options.no_figure)):
+        if not is_requested:
+            (output / name).unlink(missing_ok=True)  # of an earlier flight, whose log was replaced
     if options.csv:
         files.append(output / "log.csv")
         save_csv(record, files[-1], options.pwm)

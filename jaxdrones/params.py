@@ -127,11 +127,18 @@ def stack(team: Sequence[Params]) -> Params:
     """Stack drones to a team, with a leading drone axis on every array.
 
     Raises:
-        ValueError: an empty sequence, or a member that is already a team or cannot fly.
+        ValueError: an empty sequence, a member that is already a team or cannot fly, or members with other constants in
+            `aux`.
     """
     check_whole("number of drones", len(team))
     for i, params in enumerate(team):
         check_single(f"mass of drone {i}", params, "stack takes the parameters of single drones")
+        given, wanted = _aux_shapes(params), _aux_shapes(team[0])
+        if given != wanted:
+            raise UserError(
+                f"aux of drone {i} has {given or 'nothing'}, and that of drone 0 {wanted or 'nothing'}; give all "
+                "drones the same constants, with values that have no effect where a drone does not need them"
+            )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(_real, team))
 
 
@@ -144,6 +151,11 @@ def repeat(params: Params, n: Annotated[int, whole("number of drones")]) -> Para
     """
     check_single("mass", params, "repeat takes the parameters of a single drone")
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), _real(params))
+
+
+def _aux_shapes(params: Params) -> str:
+    leaves = jax.tree_util.tree_leaves_with_path(params.aux)
+    return ", ".join(f"{jax.tree_util.keystr(path)} {jnp.shape(leaf)}" for path, leaf in leaves)
 
 
 def _real(params: Params) -> Params:

@@ -69,6 +69,19 @@ def test_a_team_has_a_whole_number_of_drones_and_at_least_one(n):
         jaxdrones.repeat(jaxdrones.load_params("cf2x"), n)
 
 
+def test_drones_with_other_constants_cannot_be_stacked():
+    plain = jaxdrones.load_params("cf2x")
+    one, three = (plain.replace(aux={"tether": jnp.ones(shape)}) for shape in ((), (3,)))
+    with pytest.raises(
+        ValueError, match=r"aux of drone 1 has nothing, and that of drone 0 \['tether'\] \(\); give all"
+    ):
+        jaxdrones.stack([one, plain])
+    with pytest.raises(
+        ValueError, match=r"aux of drone 1 has \['tether'\] \(3,\), and that of drone 0 \['tether'\] \(\)"
+    ):
+        jaxdrones.stack([one, three])
+
+
 def test_an_empty_team_cannot_be_stacked():
     with pytest.raises(ValueError, match=r"number of drones is 0.*at least 1"):
         jaxdrones.stack([])

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.chunks import ChunkedProgram
 from jaxdrones.accelerate.fitting import NoKernelError
-from jaxdrones.checks import check_sequence, check_whole
+from jaxdrones.checks import check_function, check_sequence, check_whole
 from jaxdrones.errors import UserError
 
 _TRACER = jax.core.Tracer
@@ -73,12 +73,15 @@ class _ManyWorlds:
     def __init__(
         self, function: Callable, chunk: int | None, in_axes: int | Sequence[int], devices: Sequence[jax.Device]
     ):
+        check_function("function", function, example="jax.grad(cost)")
         self._function, self._chunk, self._in_axes = function, chunk, in_axes
         self._devices = check_sequence("devices", devices, "*jax.devices()")
         self._several_kernels = jax.jit(functools.partial(self._evaluated, kernel=False))
         self._without_kernel: set[Any] = set()  # shapes of arguments without a single kernel
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        if named:
+            raise UserError(f"{', '.join(named)} is given by name; give all arguments of many worlds by position")
         can_be_kernel = self._can_be_kernel(arguments)
         if not _is_traced(arguments):
             try:

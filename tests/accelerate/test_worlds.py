@@ -60,6 +60,13 @@ def test_arguments_that_do_not_fit_are_named(in_axes, count, says):
         jd.over_worlds(fly, in_axes=in_axes)(starts, commands[:count])
 
 
+def test_what_is_no_function_and_arguments_by_name_are_refused():
+    with pytest.raises(ValueError, match="function: 3 is not a function"):
+        jd.over_worlds(3)
+    with pytest.raises(ValueError, match="start is given by name; give all arguments of many worlds by position"):
+        jd.over_worlds(fly)(start=starts)
+
+
 def test_a_number_of_devices_is_no_device():
     with pytest.raises(ValueError, match=r"devices is 2; give a sequence, for example \(\*jax.devices\(\),\)"):
         jd.over_worlds(fly, devices=2)

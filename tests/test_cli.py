@@ -158,6 +158,9 @@ def test_no_flight_computes_what_is_not_a_number(tmp_path):
         (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
         (["fly", "circle", "--effects", "downwash_2021,downwash"], "'downwash' is given beside 'downwash_2021'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
+        (["fly", "circle", "--effects", ""], "unknown effect ''"),
+        (["fly", "circle", "--effects", "none,drag"], "--effects is 'none,drag'; give none alone"),
+        (["fly", "circle", "--effects", "drag,none"], "--effects is 'drag,none'; give none alone"),
         (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is requested for 'racer'"),
         pytest.param(
             ["fly", "circle", "--video", "folder.mp4"],

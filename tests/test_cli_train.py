@@ -347,7 +347,7 @@ def test_a_wrong_entry_of_a_file_of_options_is_named_with_the_file(content, mess
 
 
 def test_names_of_a_setting_are_separated_by_commas():
-    for text in ("omega,gravity", "omega,gravity,", "('omega', 'gravity')", "['omega', 'gravity']"):
+    for text in ("omega,gravity", "omega, gravity,", "('omega', 'gravity')", "['omega', 'gravity']"):
         assert tuple(parse_settings([f"observation={text}"])["observation"]) == ("omega", "gravity")
     assert parse_settings(["effects=drag", "action=rpm"]) == {"effects": ("drag",), "action": "rpm"}
 

@@ -8,6 +8,7 @@ from jaxdrones.arguments import seed
 from jaxdrones.cli.common import bar, print_error
 from jaxdrones.cli.options import add_drones, add_vehicle, option, split_names
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.controllers import module_of
 from jaxdrones.flights.fly import fly
@@ -56,8 +57,10 @@ def check_conditions(options: argparse.Namespace, **more) -> None:
 
 def _conditions(options: argparse.Namespace) -> dict[str, Any]:
     given = {name: getattr(options, name) for name in ("vehicle", "drones", "seed", *CONDITIONS)}
-    effects = [] if options.effects == "none" else options.effects and split_names(options.effects)
-    return given | {"effects": effects}
+    effects = None if options.effects is None else split_names(options.effects)
+    if effects is not None and len(effects) > 1 and "none" in effects:
+        raise UserError(f"--effects is {options.effects!r}; give none alone, or leave it out")
+    return given | {"effects": [] if effects == ["none"] else effects}
 
 
 def warn(diverged: dict[str, str], name: str = "") -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.options import option
+from jaxdrones.cli.options import option, split_names
 from jaxdrones.envs import TASKS
 from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
@@ -115,7 +115,7 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
             )
         changes[name] = parse_value(value)
         if name in _NAMES and isinstance(changes[name], str):
-            changes[name] = tuple(value.removesuffix(",").split(","))
+            changes[name] = tuple(split_names(value.removesuffix(",")))
     return changes
 
 

@@ -43,76 +43,18 @@ from jaxdrones.urdf import load_params
 from jaxdrones.visualization.viewer import show
 from jaxdrones.wrench import Wrench
 
-__all__ = [
-    "Battery",
-    "Camera",
-    "Effect",
-    "Model",
-    "Motors",
-    "NeighborGrid",
-    "Pair",
-    "Params",
-    "Payload",
-    "PointMass",
-    "Scene",
-    "Sensor",
-    "State",
-    "Step",
-    "TeamEffect",
-    "Wrench",
-    "battery",
-    "battery_current",
-    "battery_voltage",
-    "cable",
-    "cable_tension",
-    "charge_at",
-    "clock",
-    "crazyflie_motors",
-    "cubic_motors",
-    "downwash",
-    "downwash_2021",
-    "drag",
-    "drag_world_axes",
-    "drone_contact",
-    "dryden",
-    "euler",
-    "explain",
-    "external_force",
-    "failing",
-    "flapping_moment",
-    "ground_contact",
-    "ground_effect",
-    "ground_effect_2021",
-    "implicit_midpoint",
-    "in_wind",
-    "inflow_thrust",
-    "instant_rotors",
-    "lagging_rotors",
-    "lithium_polymer",
-    "load_params",
-    "logarithmic_wind",
-    "make",
-    "make_derivative",
-    "make_policy",
-    "make_step",
-    "midpoint",
-    "obstacle_contact",
-    "over_worlds",
-    "payload",
-    "pwm_of_thrust",
-    "pwm_rotors",
-    "quadratic_drag",
-    "rate_damping",
-    "render",
-    "repeat",
-    "rk4",
-    "rollout",
-    "rotation",
-    "semi_implicit_euler",
-    "show",
-    "stack",
-    "supply_voltage",
-    "trim_torque",
-    "vector",
-    "with_payload",
-]
+__all__ = ["Params", "State", "Wrench", "load_params", "repeat", "rotation", "stack", "vector"]
+__all__ += ["Effect", "Model", "NeighborGrid", "Pair", "PointMass", "Step", "TeamEffect"]
+__all__ += ["make_derivative", "make_step", "over_worlds", "rollout"]
+__all__ += ["euler", "implicit_midpoint", "midpoint", "rk4", "semi_implicit_euler"]
+__all__ += ["drag", "drag_world_axes", "external_force", "flapping_moment", "quadratic_drag"]
+__all__ += ["rate_damping", "trim_torque"]
+__all__ += ["downwash", "downwash_2021", "ground_effect", "ground_effect_2021", "inflow_thrust"]
+__all__ += ["drone_contact", "ground_contact", "obstacle_contact"]
+__all__ += ["clock", "dryden", "in_wind", "logarithmic_wind"]
+__all__ += ["Payload", "cable", "cable_tension", "payload", "with_payload"]
+__all__ += ["Battery", "battery", "battery_current", "battery_voltage"]
+__all__ += ["charge_at", "lithium_polymer", "supply_voltage"]
+__all__ += ["Motors", "crazyflie_motors", "cubic_motors", "failing"]
+__all__ += ["instant_rotors", "lagging_rotors", "pwm_of_thrust", "pwm_rotors"]
+__all__ += ["Camera", "Scene", "Sensor", "explain", "make", "make_policy", "render", "show"]

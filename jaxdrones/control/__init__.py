@@ -31,17 +31,5 @@ CONTROLLERS = {
     "mrac": mrac,
 }
 
-__all__ = [
-    "CONTROLLERS",
-    "Setpoint",
-    "firmware_motors",
-    "firmware_pid",
-    "for_team",
-    "geometric",
-    "mellinger",
-    "mrac",
-    "pid",
-    "rates",
-    "simple_pid",
-    "velocity",
-]
+__all__ = ["CONTROLLERS", "Setpoint", "firmware_motors", "for_team", "velocity"]
+__all__ += ["firmware_pid", "geometric", "mellinger", "mrac", "pid", "rates", "simple_pid"]

@@ -11,18 +11,5 @@ from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.registry import make
 from jaxdrones.tasks.task import ObservationTerm
 
-__all__ = [
-    "ACTIONS",
-    "OBSERVATIONS",
-    "TASKS",
-    "Action",
-    "AutoReset",
-    "ContractError",
-    "Env",
-    "Explanation",
-    "ObservationTerm",
-    "check_env",
-    "dryden",
-    "explain",
-    "make",
-]
+__all__ = ["ACTIONS", "OBSERVATIONS", "TASKS", "Action", "ObservationTerm", "dryden"]
+__all__ += ["AutoReset", "ContractError", "Env", "Explanation", "check_env", "explain", "make"]

@@ -5,17 +5,5 @@ from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import OwnNetwork, Policy, RecurrentPolicy
 from jaxdrones.learning.result import Diverged, Result
 
-__all__ = [
-    "Diverged",
-    "OwnNetwork",
-    "Policy",
-    "RecurrentPolicy",
-    "Report",
-    "Result",
-    "bptt",
-    "evaluate",
-    "league",
-    "loggers",
-    "ppo",
-    "shac",
-]
+__all__ = ["Diverged", "OwnNetwork", "Policy", "RecurrentPolicy", "Report", "Result", "evaluate"]
+__all__ += ["bptt", "league", "loggers", "ppo", "shac"]

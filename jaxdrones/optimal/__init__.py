@@ -19,19 +19,5 @@ from jaxdrones.optimal.tuning import tune
 CONTROLLERS = {"lqr": lqr, "ilqr": ilqr, "mppi": mppi}
 """Controllers by the names that the command line uses."""
 
-__all__ = [
-    "CONTROLLERS",
-    "Reference",
-    "Weights",
-    "difference",
-    "displaced",
-    "ilqr",
-    "linearize",
-    "linearize_step",
-    "lqr",
-    "mppi",
-    "reference",
-    "single",
-    "tune",
-    "weights",
-]
+__all__ = ["CONTROLLERS", "Reference", "Weights", "reference", "tune", "weights"]
+__all__ += ["difference", "displaced", "ilqr", "linearize", "linearize_step", "lqr", "mppi", "single"]

@@ -6,15 +6,5 @@ from jaxdrones.ros2.node import Flown, Node
 from jaxdrones.ros2.simulation import Simulation
 from jaxdrones.ros2.topics import QoS, Topic, Transport
 
-__all__ = [
-    "Command",
-    "Failsafe",
-    "Flown",
-    "Mode",
-    "Node",
-    "PeerLost",
-    "QoS",
-    "Simulation",
-    "Topic",
-    "Transport",
-]
+__all__ = ["Command", "Failsafe", "Flown", "Mode", "Node", "PeerLost", "Simulation"]
+__all__ += ["QoS", "Topic", "Transport"]

@@ -7,18 +7,5 @@ from jaxdrones.firmware.betaflight.pilots import Flip, Hover, Pilot, TakeOff, st
 from jaxdrones.firmware.betaflight.process import Process, find_program
 from jaxdrones.firmware.betaflight.simulation import Simulation
 
-__all__ = [
-    "BetaflightLost",
-    "Flight",
-    "Flip",
-    "Flown",
-    "Hover",
-    "Link",
-    "Pilot",
-    "Process",
-    "Simulation",
-    "Sticks",
-    "TakeOff",
-    "find_program",
-    "sticks_for",
-]
+__all__ = ["BetaflightLost", "Flight", "Flown", "Link", "Process", "Simulation", "find_program"]
+__all__ += ["Flip", "Hover", "Pilot", "Sticks", "TakeOff", "sticks_for"]

@@ -27,36 +27,10 @@ _LARGEST_P = 100  # more adds thrust: it changes two outputs up, two down, and t
 _SWITCH_ON = (1700, 2100)  # us
 _STATUS = struct.Struct("<HHHIBHBB")
 FLAGS = (
-    "no gyro",
-    "failsafe",
-    "no receiver",
-    "not disarmed",
-    "failsafe switch",
-    "runaway takeoff",
-    "crash",
-    "throttle",
-    "angle",
-    "boot",
-    "no prearm",
-    "load",
-    "calibrating",
-    "command line",
-    "menu",
-    "bus",
-    "MSP",
-    "paralyze",
-    "GPS",
-    "rescue",
-    "no telemetry",
-    "reboot required",
-    "bitbang",
-    "accelerometer",
-    "motor protocol",
-    "crash flip",
-    "altitude hold",
-    "position hold",
-    "arm switch",
-)
+    "no gyro, failsafe, no receiver, not disarmed, failsafe switch, runaway takeoff, crash, throttle, angle, boot, "
+    "no prearm, load, calibrating, command line, menu, bus, MSP, paralyze, GPS, rescue, no telemetry, reboot required, "
+    "bitbang, accelerometer, motor protocol, crash flip, altitude hold, position hold, arm switch"
+).split(", ")
 """Reasons against arming, in Betaflight's order."""
 
 

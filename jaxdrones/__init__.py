@@ -6,12 +6,14 @@ from jaxdrones.dynamics.aero import (
     drag,
     drag_world_axes,
     external_force,
+    flapping_moment,
     ground_effect,
     ground_effect_2021,
     quadratic_drag,
+    rate_damping,
+    trim_torque,
 )
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
-from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.inflow import inflow_thrust
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021

@@ -1,7 +1,8 @@
-"""Drag, ground effect and external forces on one drone; equation numbers are those of Panerati et al. 2021.
+"""Drag, ground effect, torques and external forces on one drone; equation numbers are those of Panerati et al. 2021.
 
 `drag` and `ground_effect` are the smooth, physical laws. `drag_world_axes` and `ground_effect_2021` are those of
-gym-pybullet-drones (2021), for its figures and its recorded data.
+gym-pybullet-drones (2021), for its figures and its recorded data. Flapping, rate damping and trim are identified from
+recorded flights.
 """
 
 from typing import Any
@@ -16,10 +17,11 @@ from jaxdrones.dynamics.needs import Needs, declare
 from jaxdrones.dynamics.rotors import drag_speed, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import safe_sqrt
+from jaxdrones.vector import components, safe_sqrt
 from jaxdrones.wrench import Wrench
 
 _FLOOR = 1.63  # propeller radii; below this height ground effect levels off, as for the Crazyflie of (2021)
+_MOST_CLIMB = 3.0  # m/s, limit of the climb speed in the loss; the identified flights climb at up to 2 m/s
 
 
 def drag(params: Params, state: State) -> Wrench:
@@ -80,6 +82,32 @@ def ground_effect_2021(params: Params, state: State, scene: Any = None) -> Wrenc
     roll, pitch, _ = rotation.to_rpy(state.quat)
     upright = (jnp.abs(roll) < jnp.pi / 2) & (jnp.abs(pitch) < jnp.pi / 2)
     return Wrench.of_thrusts(params.rotor_pos, jnp.where(upright, gain * thrust(params, state), 0))
+
+
+def flapping_moment(params: Params, state: State) -> Wrench:
+    """Moment of rotors in horizontal flight, from tilted discs and from drag above the center of mass.
+
+    M = sum(rotor speed) (c_y v g_y, -c_x u g_x, 0) with u, v, w the velocity relative to the air along the body axes.
+    It pitches the nose up in forward flight. The factor g = 1 - l w + k w^2 depends on the climb speed, as flights
+    of the Crazyflie 2.1 brushless show (docs/reality.md).
+    """
+    u, v, w = components(rotation.rotate_inverse(state.quat, state.vel - params.wind))
+    climb = w / safe_sqrt(1 + (w / _MOST_CLIMB) ** 2)
+    loss_x, loss_y, gain = components(params.flapping_climb)
+    c_x, c_y = components(params.flapping_coeff)
+    about_x = c_y * v * (1 - loss_y * climb + gain * climb**2)
+    about_y = -c_x * u * (1 - loss_x * climb + gain * climb**2)
+    return Wrench.of_torque(drag_speed(params, state) * jnp.stack([about_x, about_y, jnp.zeros_like(u)]))
+
+
+def rate_damping(params: Params, state: State) -> Wrench:
+    """Torque against the angular velocity: a sinking rotor gains thrust, a rising one loses thrust."""
+    return Wrench.of_torque(-params.relative_density * params.rate_damping * state.omega)
+
+
+def trim_torque(params: Params, state: State) -> Wrench:
+    """Constant torque `params.trim_torque` of an unbalanced vehicle."""
+    return Wrench.of_torque(params.trim_torque)
 
 
 def external_force(params: Params, state: State) -> Wrench:

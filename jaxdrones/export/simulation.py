@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, whole
 from jaxdrones.control import CONTROLLERS, Setpoint
-from jaxdrones.dynamics import drag, ground_contact
+from jaxdrones.dynamics.aero import drag
+from jaxdrones.dynamics.contact import ground_contact
 from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import HostStep

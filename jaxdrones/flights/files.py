@@ -17,7 +17,7 @@ from jaxdrones.flights.bag import read_bag
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog, ImageSequence, LoggedConditions
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
+from jaxdrones.sensing.scene import scene_from_dict, scene_to_dict
 from jaxdrones.writing import replaced
 
 _ALIASES = {"gyro": "omega", "ref_pos": "target_pos", "ref_yaw": "target_yaw"}

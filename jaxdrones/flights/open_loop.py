@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.dynamics.aero import drag
-from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
+from jaxdrones.dynamics.aero import drag, flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.integrators import midpoint
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.engine.explicit import make_derivative

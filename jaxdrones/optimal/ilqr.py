@@ -9,13 +9,12 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones.arguments import Count, checked
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
-from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
 from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_weights, hover, posed
 from jaxdrones.params import Params
@@ -24,6 +23,7 @@ from jaxdrones.state import State
 from jaxdrones.status import OnFailure, Status, is_finite, raise_unless_ok, status_of
 
 _STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
+_QP_ITERATIONS, _QP_STEP_SIZES = 6, tuple(0.4**k for k in range(6))
 _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
 _LESS, _MORE = 0.2, 10.0  # factors of the regularization after an iteration with and without an improvement
 
@@ -232,3 +232,38 @@ def _backward(
     size = models[0].shape[-1]
     end = (jnp.zeros(size, r.dtype), jnp.zeros((size, size), r.dtype))
     return jax.lax.scan(backward, end, models, reverse=True)[1]
+
+
+def box_qp(
+    hessian: Float[Array, "m m"], gradient: Float[Array, " m"], low: Float[Array, " m"], high: Float[Array, " m"]
+) -> tuple[Float[Array, " m"], Bool[Array, " m"]]:
+    """Minimize x H x / 2 + g x between bounds, by projected Newton steps (Tassa, Mansard, Todorov 2014, algorithm 1).
+
+    H is symmetric and positive. Return the minimizer (m,), and the mask of its free components, between their bounds.
+    """
+    sizes = jnp.asarray(_QP_STEP_SIZES, gradient.dtype)
+
+    def cost(x: Array) -> Array:
+        return x @ (hessian @ x) / 2 + gradient @ x
+
+    def free_at(x: Array) -> tuple[Array, Array]:
+        slope = gradient + hessian @ x
+        return slope, ~(((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0)))
+
+    def newton(x: Array, _: None) -> tuple[Array, None]:
+        slope, free = free_at(x)
+        step = -solve_free(hessian, slope, free)
+        tried = jax.vmap(lambda size: jnp.clip(x + size * step, low, high))(sizes)
+        costs = jax.vmap(cost)(tried)
+        best = jnp.argmin(costs)
+        return jnp.where(costs[best] < cost(x), tried[best], x), None
+
+    x, _ = jax.lax.scan(newton, jnp.clip(jnp.zeros_like(gradient), low, high), length=_QP_ITERATIONS)
+    return x, free_at(x)[1]
+
+
+def solve_free(hessian: Float[Array, "m m"], right: Float[Array, "m *n"], free: Bool[Array, " m"]) -> Array:
+    """Solution of H x = right in the free components, zero in the others."""
+    both = free[:, None] & free[None, :]
+    part = jnp.where(both, hessian, jnp.eye(len(hessian), dtype=hessian.dtype))
+    return jnp.linalg.solve(part, jnp.where(free.reshape(-1, *[1] * (right.ndim - 1)), right, 0))

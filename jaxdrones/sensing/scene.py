@@ -86,19 +86,17 @@ class Scene(PyTreeNode, kw_only=True):
     @property
     def has_obstacles(self) -> bool:
         """Whether there are obstacles; static."""
-        return any(getattr(self, name) is not None for name in KINDS) or bool(self.meshes or self.urdfs)
+        return bool(self._stacks or self.meshes or self.urdfs)
 
     @property
     def count(self) -> int:
         """Number of obstacles; static."""
-        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
-        return sum(len(stack.pos) for stack in stacks) + len(self.meshes) + len(self.urdfs)
+        return sum(len(stack.pos) for stack in self._stacks) + len(self.meshes) + len(self.urdfs)
 
     @property
     def obstacles(self) -> tuple[Any, ...]:
         """Single obstacles, in the order of their numbers."""
-        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
-        return (*(single(stack, i) for stack in stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
+        return (*(single(stack, i) for stack in self._stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
 
     @property
     def numbered(self) -> dict[int, Any]:
@@ -107,8 +105,7 @@ class Scene(PyTreeNode, kw_only=True):
 
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
         """Obstacles of each kind, with a leading axis, as arrays of this type."""
-        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
-        return [_as_arrays(stack, dtype) for stack in stacks]
+        return [_as_arrays(stack, dtype) for stack in self._stacks]
 
     def distance(self, point: ArrayLike) -> Array:
         """Signed distance of a point from the nearest surface, m; negative inside an obstacle or underground.
@@ -171,6 +168,10 @@ class Scene(PyTreeNode, kw_only=True):
             rest = _inactive(kind, length - count)
             arrays[name] = _joined([rest] if stack is None else [stack, rest])
         return self.replace(**arrays)
+
+    @property
+    def _stacks(self) -> list[Any]:
+        return [stack for name in KINDS if (stack := getattr(self, name)) is not None]
 
     def _analytic(self, dtype: DTypeLike) -> list[Obstacle]:
         check_scene("scene", self)
@@ -260,3 +261,27 @@ def _rows(obstacle: Obstacle) -> Obstacle:
         return jnp.broadcast_to(array, leading + one).reshape(math.prod(leading), *one)
 
     return obstacle.replace(**{name: rows(name, array) for name, array in arrays.items()})
+
+
+def scene_to_dict(scene: Scene) -> dict[str, Any]:
+    """Convert the concrete scene of one world to a JSON object; inactive obstacles are left out.
+
+    It has `ground`, whether there is a ground plane, and `obstacles`, a list of objects with the `kind` (such as `Box`)
+    and the fields of each obstacle.
+    """
+    obstacles = []
+    for solid in scene.numbered.values():
+        fields = {name: x for name, x in vars(solid).items() if name not in ("active", "path")}
+        entry = {"kind": type(solid).__name__} | {name: np.asarray(x, float).tolist() for name, x in fields.items()}
+        obstacles.append(entry | {"path": str(solid.path)} if isinstance(solid, File) else entry)
+    return {"ground": scene.ground, "obstacles": obstacles}
+
+
+def scene_from_dict(entries: dict[str, Any]) -> Scene:
+    """Inverse of `scene_to_dict`; obstacles are in the order of their numbers."""
+    classes: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS.values(), Mesh, Urdf)}
+    obstacles = []
+    for entry in entries["obstacles"]:
+        fields = {name: tuple(x) if isinstance(x, list) else x for name, x in entry.items() if name != "kind"}
+        obstacles.append(classes[entry["kind"]](**fields))
+    return Scene.of(*obstacles, ground=entries["ground"])

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from jaxdrones.dynamics import instant_rotors
+from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.observations import last_actions
 from jaxdrones.envs.randomize import AnyVehicle, realistic_randomization, scaled

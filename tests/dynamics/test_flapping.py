@@ -7,7 +7,7 @@ import pytest
 from helpers import flying
 
 import jaxdrones
-from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
+from jaxdrones.dynamics.aero import flapping_moment, rate_damping, trim_torque
 
 params = jaxdrones.load_params("cf2x").replace(
     flapping_coeff=jnp.array([1e-7, 8e-8]),

@@ -7,7 +7,7 @@ import pytest
 from helpers import assert_close, assert_finite, flying, jit_unoptimized, make_step
 
 import jaxdrones as jd
-from jaxdrones.dynamics.flapping import flapping_moment, rate_damping
+from jaxdrones.dynamics.aero import flapping_moment, rate_damping
 from jaxdrones.dynamics.inflow import flow_through
 from jaxdrones.dynamics.power import battery_power
 

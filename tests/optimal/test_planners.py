@@ -15,7 +15,7 @@ from jaxdrones import optimal, rotation
 from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.optimal import ilqr, lqr, mppi
-from jaxdrones.optimal.box_qp import box_qp
+from jaxdrones.optimal.ilqr import box_qp
 from jaxdrones.optimal.mppi import importance
 from jaxdrones.status import PlanningError, Status
 from jaxdrones.tasks.curves import SHAPES, setpoint_on

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import STATE_AND_SPEEDS, FlightLog
-from jaxdrones.sensing.serialization import scene_to_dict
+from jaxdrones.sensing.scene import scene_to_dict
 from jaxdrones.visualization.palette import COLORS, DISTINCT, as_rgb, colors
 from jaxdrones.visualization.shots import only_shapes
 from jaxdrones.visualization.viewer.contacts import contact_forces

@@ -24,7 +24,6 @@ _FOOT = 0.3048  # m
 _LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, range of the specification's low-altitude model
 _ROUGHNESS, _REFERENCE = 0.15 * _FOOT, 20 * _FOOT  # m, roughness length and reference height of the mean wind
 _SQRT3 = math.sqrt(3.0)
-_TERMS = 40  # terms of a series for arguments up to 1
 
 Disturbance = Callable[[jax.Array, Params, float], Params]
 """(key, params, control period) of a team -> its parameters with wind and external force of the next control step."""
@@ -210,7 +209,9 @@ def _correlated(n1: Float[Array, ""], n2: Float[Array, ""], step: float) -> Floa
     The covariance is the integral of exp(-2 s) (1, s; s, s^2) from 0 to the step; for an infinite step it is the
     stationary covariance.
     """
-    a, b, c = (_tail(k, 2 * step) * weight for k, weight in ((1, 1 / 2), (2, 1 / 4), (3, 1 / 4)))
+    from scipy.special import gammainc  # loading it takes a quarter of a second
+
+    a, b, c = (float(gammainc(k, 2 * step)) * weight for k, weight in ((1, 1 / 2), (2, 1 / 4), (3, 1 / 4)))
     first = math.sqrt(a)
     return jnp.stack([first * n1, b / first * n1 + math.sqrt(c - b * b / a) * n2])
 
@@ -228,12 +229,3 @@ def _along(mean: Float[Array, "3"], gust: Float[Array, "3"]) -> Float[Array, "3"
     length = jnp.sqrt(jnp.where(calm, 1, square))
     cos, sin = jnp.where(calm, 1, x / length), jnp.where(calm, 0, y / length)
     return jnp.stack([cos * gust[0] - sin * gust[1], sin * gust[0] + cos * gust[1], gust[2]])
-
-
-def _tail(k: int, x: float) -> float:
-    """1 - exp(-x) (1 + x + ... + x^(k-1) / (k-1)!), without cancellation for small x."""
-    if math.isinf(x):
-        return 1.0
-    if x > 1:
-        return 1 - math.exp(-x) * sum(x**i / math.factorial(i) for i in range(k))
-    return math.exp(-x) * sum(x**i / math.factorial(i) for i in range(k, _TERMS))

@@ -10,6 +10,7 @@ from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle, option
 from jaxdrones.cli.report import print_results
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
+from jaxdrones.envs.explanation import aligned
 from jaxdrones.errors import UserError
 from jaxdrones.flights import fit, inconsistencies, load_flights
 from jaxdrones.flights.files import find_log
@@ -98,10 +99,7 @@ def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
 
 def parameter_table(report) -> str:
     """Table of the estimate and standard error of each parameter."""
-    width = max(map(len, report.parameters))
-    lines = [
-        f"  {name.ljust(width)}  {e.value: .4g} +- {e.std_error:.2g}"
-        f"{'' if e.identifiable else '  (not identifiable from these flights)'}"
-        for name, e in report.parameters.items()
-    ]
-    return "\n".join(["SI units (kg, m, s, N, rad, V, RPM)", *lines])
+    doubt = "  (not identifiable from these flights)"
+    estimates = report.parameters.values()
+    texts = [f"{e.value: .4g} +- {e.std_error:.2g}{'' if e.identifiable else doubt}" for e in estimates]
+    return f"SI units (kg, m, s, N, rad, V, RPM)\n{aligned(list(zip(report.parameters, texts, strict=True)))}"

@@ -3,10 +3,12 @@
 import argparse
 import json
 import math
+import textwrap
 from typing import Any
 
 import numpy as np
 
+from jaxdrones.envs.explanation import aligned
 from jaxdrones.training.presets import realism
 
 _COLUMNS = {  # result: (heading, format)
@@ -77,8 +79,7 @@ def table(results: list[dict]) -> str:
         ["-" if _finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
         for row in results
     ]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return textwrap.dedent(aligned(rows, str.rjust))
 
 
 def described(recipe, **more: Any) -> str:
@@ -104,8 +105,7 @@ def evaluation_table(report: dict) -> str:
         ["ended early", ends],
         ["final metrics", others],
     ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"  {name.ljust(width)}  {text}" for name, text in rows if text)
+    return aligned([row for row in rows if row[1]])
 
 
 def success(report: dict) -> str:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -254,7 +254,7 @@ def entries_table(entries: Sequence[Entry]) -> str:
             [str(i), entry.term, what.name, what.unit, what.frame, f"{number(entry.low)} to {number(entry.high)}"]
         )
         rows[-1] += values if scaled else []
-    return _table(rows)
+    return aligned(rows)
 
 
 def _parts(parts: Sequence[Part]) -> str:
@@ -262,14 +262,15 @@ def _parts(parts: Sequence[Part]) -> str:
         [part.name, *([] if part.weight is None else [number(part.weight)]), part.meaning or "(it has no docstring)"]
         for part in parts
     ]
-    return _table(rows) if rows else "  none"
+    return aligned(rows) if rows else "  none"
 
 
 def _pairs(pairs: dict[str, str]) -> str:
-    return _table([[name, text] for name, text in pairs.items()])
+    return aligned(list(pairs.items()))
 
 
-def _table(rows: list[list[str]]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+def aligned(rows: Sequence[Sequence[str]], align: Callable[[str, int], str] = str.ljust) -> str:
+    """Table of rows of cells, indented, with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(align, row, widths)) for row in rows)
     return "\n".join(f"  {line}".rstrip() for line in lines)

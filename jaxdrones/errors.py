@@ -1,8 +1,10 @@
 """Error of users' mistakes, and installation hints."""
 
+import contextlib
 import importlib.metadata
 import json
 import urllib.parse
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -24,3 +26,12 @@ def install(extra: str) -> str:
         origin = None
     url = urllib.parse.urlsplit(json.loads(origin or "{}").get("url", ""))
     return f'pip install "{urllib.parse.unquote(url.path) or "WHEEL"}[{extra}]"'
+
+
+@contextlib.contextmanager
+def needs(package: str, extra: str, kind: type[Exception] = ImportError) -> Iterator[None]:
+    """Context of imports of an optional package; an error of this kind tells how to install its extra."""
+    try:
+        yield
+    except ImportError as error:
+        raise kind(f"{package} is not installed; {install(extra)}") from error

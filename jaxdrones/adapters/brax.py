@@ -24,13 +24,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxdrones import envs
 from jaxdrones.adapters.session import rewarding
 from jaxdrones.arguments import Count, checked
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 
-try:
-    with contextlib.redirect_stdout(sys.stderr):  # mujoco prints what it could not import
-        from brax.envs import base
-except ImportError as error:
-    raise ImportError(f"brax is not installed; {install('brax')}") from error
+with needs("brax", "brax"), contextlib.redirect_stdout(sys.stderr):  # mujoco prints what it could not import
+    from brax.envs import base
 
 _COLORED = 4  # axes of color images of a team
 _NEXT = np.uint32(2**32 - 1)  # fold for the key of the next episode, above the number of steps of any episode

@@ -10,12 +10,10 @@ import numpy as np
 from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import TaskOrEnv, TeamEpisodes, flat
 from jaxdrones.arguments import checked
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 
-try:
+with needs("pettingzoo", "pettingzoo"):
     import pettingzoo
-except ImportError as error:
-    raise ImportError(f"pettingzoo is not installed; {install('pettingzoo')}") from error
 
 
 def parallel_env(task: TaskOrEnv, **options: Any) -> ParallelEnv:

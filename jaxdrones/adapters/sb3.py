@@ -7,12 +7,10 @@ import numpy as np
 
 from jaxdrones.adapters import gymnasium
 from jaxdrones.adapters.session import TaskOrEnv
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 
-try:
+with needs("stable-baselines3", "sb3"):
     from stable_baselines3.common import vec_env
-except ImportError as error:
-    raise ImportError(f"stable-baselines3 is not installed; {install('sb3')}") from error
 
 
 class VecEnv(vec_env.VecEnv):

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from jaxdrones.arguments import choice
 from jaxdrones.cli.options import option
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 
 SHELLS = ("bash", "zsh", "fish")
 _FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
@@ -28,10 +28,8 @@ def add(commands, root: argparse.ArgumentParser) -> None:
 
 
 def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    try:
+    with needs("shtab", "cli", UserError):
         import shtab
-    except ImportError:
-        raise UserError(f"shtab is not installed; {install('cli')}") from None
     for action in _actions(root):
         if known := getattr(action, "known", ()):
             action.choices = known

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 from jaxdrones.export import layers
 from jaxdrones.export.layers import Graph, Layer, Tensor
 from jaxdrones.export.text import Description
@@ -140,13 +140,11 @@ def model(graph: Graph, description: Description) -> bytes:
     Its inputs are `obs` (batch, d), images (batch, height, width, ...) and `hidden_state` (batch, size), its outputs
     `act` (batch, a) and `next_hidden_state`.
     """
-    try:
+    with needs("onnx", "export", UserError):
         import onnx
         import onnx.checker
         import onnx.helper
         import onnx.numpy_helper
-    except ImportError:
-        raise UserError(f"onnx is not installed; {install('export')}") from None
     nodes = _Nodes(onnx)
     for layer in graph.layers:
         nodes.add(layer)

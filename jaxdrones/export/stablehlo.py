@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import export
 from jaxtyping import Array
 
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 from jaxdrones.export.layers import Tensor
 from jaxdrones.learning.networks import Policy
 
@@ -26,10 +26,8 @@ def program(policy: Policy, images: tuple[Tensor, ...]) -> bytes:
         ValueError: flatbuffers is not installed.
     """
     assert not policy.per_agent, "give the policy of one drone"
-    try:
+    with needs("flatbuffers", "export", UserError):
         import flatbuffers  # noqa: F401 - with which jax.export saves
-    except ImportError:
-        raise UserError(f"flatbuffers is not installed; {install('export')}") from None
     policy = jax.tree.map(_float32, policy)
     (batch,) = export.symbolic_shape("batch")
 

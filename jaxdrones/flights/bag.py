@@ -5,17 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 from jaxdrones.flights.log import OPTIONAL
 
 
 def read_bag(path: Path) -> dict[str, np.ndarray]:
     """Arrays of a bag: poses and twists of /drone_0/odom, ... and rotor speeds of /drone_0/motors, ..."""
-    try:
+    with needs("rosbags", "ros2"):
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
     store = get_typestore(Stores.ROS2_JAZZY)
     found: dict[str, dict[int, Any]] = {}
     kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxdrones import assets
 from jaxdrones.checks import look_up
 from jaxdrones.envs import Env
-from jaxdrones.errors import UserError, install
+from jaxdrones.errors import UserError, needs
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.adaptive import AdaptivePolicy
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
@@ -29,10 +29,8 @@ class Raptor(PyTreeNode):
     @classmethod
     def load(cls) -> Self:
         """Weights of the package foundation-policy."""
-        try:
+        with needs("foundation-policy", "raptor"):
             from foundation_policy import Raptor as Published
-        except ImportError:
-            raise ImportError(f"foundation-policy is not installed; {install('raptor')}") from None
         dense, gru, out = Published().layers
         parts = {
             "in": dense.weights,

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import install
+from jaxdrones.errors import needs
 
-try:
+with needs("jaxdrones.optimal: casadi", "casadi"):
     import casadi
-except ImportError as error:
-    raise ImportError(f"jaxdrones.optimal: casadi is not installed; {install('casadi')}") from error
 
 
 def select(which: Any, *cases: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdrones.errors import install
+from jaxdrones.errors import needs
 
 _NAMES = {
     "builtin_interfaces": "Time",
@@ -48,10 +48,8 @@ class Field(NamedTuple):
 @functools.cache
 def typestore() -> Any:
     """ROS 2 message types of rosbags."""
-    try:
+    with needs("rosbags", "ros2"):
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
     return get_typestore(Stores.ROS2_JAZZY)
 
 

@@ -1,7 +1,9 @@
 """Text that the targets share: the description of inputs and outputs, and numbers."""
 
 import dataclasses
+import re
 import textwrap
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from jaxdrones.envs.explanation import Explanation, entries_table
 from jaxdrones.export.layers import BYTES, Graph
 
 WIDTH = 120
+_DEFINITION = re.compile(r"^(?:static inline \w+ NAME_|function |const )(\w+)", re.MULTILINE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,3 +82,15 @@ def numbers(array: np.ndarray, suffix: str = "") -> str:
     """Indented lines of an array's numbers, row by row."""
     text = ", ".join(f"{number(x)}{suffix}" for x in array.ravel())
     return textwrap.fill(text, WIDTH, initial_indent="    ", subsequent_indent="    ", break_long_words=False)
+
+
+def functions(file: str, names: set[str]) -> list[str]:
+    """Functions of these names in a file of this folder, in its order, each with the comment above it.
+
+    An empty line follows each function, and a function that calls `sigmoid` needs it.
+    """
+    blocks = (Path(__file__).parent / file).read_text().strip().split("\n\n")
+    by_name = {match[1]: block for block in blocks if (match := _DEFINITION.search(block))}
+    if any("sigmoid(" in by_name[name] for name in names):
+        names = names | {"sigmoid"}
+    return [block for name, block in by_name.items() if name in names]

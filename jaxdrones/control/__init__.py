@@ -21,15 +21,8 @@ from jaxdrones.control import (
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import for_team
 
-CONTROLLERS = {
-    "pid": pid,
-    "simple_pid": simple_pid,
-    "geometric": geometric,
-    "rates": rates,
-    "firmware_pid": firmware_pid,
-    "mellinger": mellinger,
-    "mrac": mrac,
-}
+_MODULES = pid, simple_pid, geometric, rates, firmware_pid, mellinger, mrac
+CONTROLLERS = {module.__name__.rpartition(".")[2]: module for module in _MODULES}
 
 __all__ = ["CONTROLLERS", "Setpoint", "firmware_motors", "for_team", "velocity"]
 __all__ += ["firmware_pid", "geometric", "mellinger", "mrac", "pid", "rates", "simple_pid"]

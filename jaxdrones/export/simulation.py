@@ -187,9 +187,7 @@ def _physics(params: Params, dt: float) -> Callable[..., State]:
 
 def _controller(name: str, params: Params, dt: float) -> Callable[..., tuple[Any, Array]]:
     def fly(gains: Any, memory: Any, state: State, goal: Float[Array, "3"]) -> tuple[Any, Array]:
-        zero = jnp.zeros(3)
-        target = Setpoint(pos=goal, vel=zero, acc=zero, yaw=jnp.zeros(()), omega=zero)
-        return CONTROLLERS[name].control(gains, params, memory, state, target, dt=dt)
+        return CONTROLLERS[name].control(gains, params, memory, state, Setpoint.at(goal), dt=dt)
 
     return fly
 

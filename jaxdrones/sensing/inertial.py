@@ -1,6 +1,7 @@
 """Inertial measurement units: accelerometer and gyroscope, with errors of named parts."""
 
 import dataclasses
+import functools
 import math
 from typing import Annotated
 
@@ -70,12 +71,9 @@ def imu(
         place = None if at_center else jnp.asarray(offset, state.pos.dtype)
         return read(part, key, memory, motion(params, state, rate_, place), 1 / rate)
 
-    def init(key: jax.Array, params: Params) -> dict[str, Errors]:
-        return begin(part, key, params)
-
     entries = (*quantities("specific force", "m/s^2", "body"), *quantities("body rates measured", "rad/s", "body"))
     bound = max(part.acc.limit, part.gyro.limit)
-    return Sensor(name, measure, init, bound=bound, rate=rate, entries=entries, clocked=True)
+    return Sensor(name, measure, functools.partial(begin, part), bound=bound, rate=rate, entries=entries, clocked=True)
 
 
 def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:

@@ -54,8 +54,7 @@ def scene_of(level: int) -> Scene | Callable[[jax.Array], Scene]:
     """
     if level not in LEVELS:
         raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
-    scene = functools.partial(_scene, level)
-    return jax.jit(scene)() if level < 2 else scene
+    return functools.partial(_random_scene, level) if level > 1 else jax.jit(lambda: _solids(GATES, POLES))()
 
 
 def randomization_of(level: int) -> tuple[Callable[[jax.Array, Params], Params], ...]:
@@ -146,14 +145,12 @@ METRICS = {
 }
 
 
-def _scene(level: int, key: jax.Array | None = None) -> Scene:
-    """Gates and poles of a level, random in levels 2 and 3."""
-    if key is None:
-        return _solids(GATES, POLES)
+def _random_scene(level: int, key: jax.Array) -> Scene:
+    """Gates and poles of level 2 or 3."""
     gate_key, pole_key = jax.random.split(key)
     u = jax.random.uniform(gate_key, GATES.shape, minval=-1, maxval=1)
     if level == 3:
-        return _solids(_random_track(u))
+        return track(_random_track(u), OPENING, FRAME)
     moved = jax.random.uniform(pole_key, POLES.shape, minval=-_POLE_RANGE, maxval=_POLE_RANGE)
     return _solids(jnp.asarray(GATES) + jnp.asarray(_GATE_RANGE)[None] * u, jnp.asarray(POLES) + moved)
 
@@ -166,9 +163,7 @@ def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
 
 
-def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
-    if poles is None:
-        return track(gates, OPENING, FRAME)
+def _solids(gates: ArrayLike, poles: ArrayLike) -> Scene:
     gates, poles = jnp.asarray(gates, float), jnp.asarray(poles, float)
     pos = jnp.concatenate([poles, jnp.full((len(poles), 1), POLE_HEIGHT / 2)], axis=-1)
     beams = jax.vmap(lambda pose: gate(pose[:3], pose[3], OPENING, FRAME))(gates)

@@ -20,19 +20,14 @@ class PyTreeNode(flax.struct.PyTreeNode):
         if name not in _registered:
             _registered.add(name)
             export.register_pytree_node_serialization(
-                cls, serialized_name=name, serialize_auxdata=_to_bytes, deserialize_auxdata=_from_bytes
+                cls,
+                serialized_name=name,
+                serialize_auxdata=lambda data: json.dumps(data).encode(),
+                deserialize_auxdata=lambda data: as_tuple(json.loads(bytes(data))),
             )
 
 
 _registered: set[str] = set()
-
-
-def _to_bytes(auxdata: Any) -> bytes:
-    return json.dumps(auxdata).encode()
-
-
-def _from_bytes(data: bytes | bytearray) -> Any:
-    return as_tuple(json.loads(bytes(data)))
 
 
 def as_tuple(value: Any) -> Any:

@@ -128,7 +128,7 @@ def fly_episode(
     if isinstance(env.physics, HostStep):
         decide, fly = jax.jit(decide), loop
     elif isinstance(policy, PyTreeNode):  # an argument, to share the program between policies of one shape
-        fly = functools.partial(_compiled_leg(), env, policy)
+        fly = functools.partial(_compiled_leg, env, policy)
     else:
         fly = jax.jit(functools.partial(_leg, env, policy))
     params, scene = jax.device_get((start.params, start.scene))
@@ -182,9 +182,7 @@ def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tu
     return jax.lax.scan(functools.partial(_step, env, functools.partial(act, policy)), carry, keys)
 
 
-@functools.cache
-def _compiled_leg() -> Callable:
-    return jax.jit(_leg, static_argnums=0)
+_compiled_leg = jax.jit(_leg, static_argnums=0)
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict[str, np.ndarray]) -> bool | None:

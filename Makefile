@@ -35,7 +35,7 @@ test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
 
 test-slow: .venv/installed  ## all of them, or a part: make test-slow ONLY="--shard 2/6 --since '3 hours ago'"
-	$(BIN)/pytest -n 2 --dist load -m slow $(ONLY)
+	XLA_FLAGS= $(BIN)/pytest -n 2 --dist load -m slow $(ONLY)
 
 test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax, JaxMARL, W&B and MLflow, in a separate environment
 	.venv-libraries/bin/pytest tests/learning/test_loggers.py tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)

@@ -1,6 +1,7 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
 import gc
+import importlib.metadata
 import importlib.util
 import os
 from pathlib import Path
@@ -9,6 +10,10 @@ from pathlib import Path
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+# Compile without most optimizations, in half of the time; with `XLA_FLAGS=`, as in `make test-slow`, as for users. Laws
+# about compiled programs ask for the latter by `helpers.jit_optimized`. Later versions of JAX lack one of the flags.
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 
 import jax
 import jaxtyping

@@ -12,7 +12,7 @@ import pytest
 
 import jaxdrones
 from jaxdrones import Params, State
-from jaxdrones.accelerate.compiler import training_options
+from jaxdrones.accelerate import compiler
 
 VEHICLES = ("cf2x", "cf2p", "hb", "racer")
 """The vehicles of gym-pybullet-drones; tests/test_vehicles.py flies all bundled ones."""
@@ -33,7 +33,13 @@ SMALL_OPTIONS = [word for name, value in SMALL_TRAINING.items() for word in ("--
 
 def jit_unoptimized(function, **arguments):
     """`jax.jit` in a third of the time for large programs that run a few times and whose law is not about compiling."""
-    options = training_options(large_arrays=False) | {"xla_backend_optimization_level": 0}
+    options = compiler.training_options(large_arrays=False) | {"xla_backend_optimization_level": 0}
+    return jax.jit(function, compiler_options=options, **arguments)
+
+
+def jit_optimized(function, **arguments):
+    """`jax.jit` with the options that users have, whatever XLA_FLAGS says; for laws about compiled programs."""
+    options = compiler._known(xla_cpu_use_fusion_emitters=True, xla_backend_optimization_level=3)
     return jax.jit(function, compiler_options=options, **arguments)
 
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_optimized, jit_unoptimized
 from scipy.spatial.transform import Rotation
 
 import jaxdrones as jd
@@ -160,10 +161,11 @@ def in_worlds(quats):
 )
 def test_angles_in_single_precision_are_right_however_they_are_compiled(count, near):
     quats = attitudes(count, near)
-    check_angles(quats, in_worlds(quats))
-    check_angles(quats, jax.jit(jax.vmap(rotation.to_rpy))(quats))
+    for compiled in jit_optimized, jit_unoptimized:
+        check_angles(quats, compiled(in_worlds)(quats))
+        check_angles(quats, compiled(jax.vmap(rotation.to_rpy))(quats))
     check_angles(quats, jax.vmap(rotation.to_rpy)(quats))  # eager
-    check_angles(quats[-5:], [jax.jit(rotation.to_rpy)(quat) for quat in quats[-5:]])
+    check_angles(quats[-5:], [jit_optimized(rotation.to_rpy)(quat) for quat in quats[-5:]])
 
 
 @pytest.mark.slow

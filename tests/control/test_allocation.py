@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from closed_loop import mirrored, recorded_vehicle
-from helpers import VEHICLES, assert_finite, jit_unoptimized
+from helpers import VEHICLES, assert_finite, jit_optimized, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State
@@ -18,7 +18,7 @@ N = 200  # wrenches in a batch, as in the recorded cases
 
 allocate = jax.jit(rpm_from_wrench)
 differentiate = jit_unoptimized(jax.jacrev(rpm_from_wrench, argnums=(1, 2)))
-allocate_all = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, 0)))
+allocate_all = jit_optimized(jax.vmap(rpm_from_wrench, (None, 0, 0)))
 
 MIXERS = {  # columns roll, pitch, yaw; of gym-pybullet-drones
     "cf2x": [(-0.5, -0.5, -1), (-0.5, 0.5, 1), (0.5, 0.5, -1), (0.5, -0.5, 1)],
@@ -196,7 +196,7 @@ def test_a_demand_of_thrust_far_beyond_reach_is_full_thrust_with_roll_and_pitch(
     params = jaxdrones.load_params(vehicle)
     torque = jnp.array([0.05, -0.02, 0.3]) * params.max_xy_torque
     thrusts = params.max_thrust * 10.0 ** jnp.arange(3, 30)
-    rpm = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, None)))(params, thrusts, torque)
+    rpm = jit_optimized(jax.vmap(rpm_from_wrench, (None, 0, None)))(params, thrusts, torque)
     expected = jit_unoptimized(rpm_from_wrench)(params, 2 * params.max_thrust, torque)
     assert jnp.max(expected) == params.max_rpm
     np.testing.assert_allclose(rpm, np.broadcast_to(expected, rpm.shape), rtol=1e-4)  # roundings of 100 times the limit

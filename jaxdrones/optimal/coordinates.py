@@ -96,11 +96,45 @@ def tracking_error(params: Params, state: State, reference: State) -> Float[Arra
 
     Weights and gains are then independent of the heading.
     """
-    pos, turn, vel, omega, rpm, aux = _parts(params, state, reference)
-    x_axis = rotation.axes(reference.quat)[0]
+    parts = _parts(params, state, reference)
+    return _along(_heading(reference.quat), parts, parts[1])
+
+
+def feedback_error(params: Params, state: State, reference: State) -> Float[Array, " d"]:
+    """`tracking_error` for large errors of the heading, the same to first order.
+
+    A drone accelerates along its own heading. Positions and velocities are therefore along the heading of the drone,
+    and the attitude is a turn about the z axis of the reference (third component) and then a tilt about the x and y
+    axes of the body, each as twice the vector part of its quaternion.
+    """
+    parts = _parts(params, state, reference)
+    error = rotation.multiply(rotation.conjugate(reference.quat), state.quat)
+    error = jnp.where(error[3] < 0, -error, error)
+    square = error[2] ** 2 + error[3] ** 2
+    defined = square > jnp.finfo(error.dtype).eps  # not upside down with respect to the reference
+    length = jnp.sqrt(jnp.where(defined, square, 1))
+    sin, cos = jnp.where(defined, error[2] / length, 0), jnp.where(defined, error[3] / length, 1)  # of half the turn
+    zero = jnp.zeros_like(sin)
+    tilt = rotation.multiply(jnp.stack([zero, zero, -sin, cos]), error)
+    about_x, about_y = jnp.where(tilt[3] < 0, -2, 2) * tilt[:2]
+    c, s = _heading(reference.quat)
+    cos_turn, sin_turn = cos * cos - sin * sin, 2 * sin * cos
+    heading = c * cos_turn - s * sin_turn, s * cos_turn + c * sin_turn
+    return _along(heading, parts, jnp.stack([about_x, about_y, 2 * sin]))
+
+
+def _heading(quat: Float[Array, "4"]) -> tuple[Array, Array]:
+    """Cosine and sine of the heading of an attitude."""
+    x_axis = rotation.axes(quat)[0]
     x, y = x_axis[0], x_axis[1]
     length = jnp.sqrt(jnp.maximum(x * x + y * y, jnp.finfo(x.dtype).tiny))
-    cos, sin = x / length, y / length
+    return x / length, y / length
+
+
+def _along(heading: tuple[Array, Array], parts: tuple[Any, ...], turn: Float[Array, "3"]) -> Float[Array, " d"]:
+    """Parts of a difference as a vector, with positions and velocities along a heading, and another turn."""
+    cos, sin = heading
+    pos, _, vel, omega, rpm, aux = parts
 
     def along(v: Array) -> Array:
         return jnp.stack([cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]])

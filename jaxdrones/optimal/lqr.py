@@ -11,7 +11,7 @@ from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
-from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
+from jaxdrones.optimal.coordinates import command_unit, feedback_error, linearize_step, single
 from jaxdrones.optimal.problem import Weights, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -35,7 +35,7 @@ class Memory(PyTreeNode):
     """Solution of the regulator's problem, a function of the drone alone."""
 
     gain: Array
-    """(4, d) K of u = -K z, z a `tracking_error`."""
+    """(4, d) K of u = -K z, z a `feedback_error`."""
     value: Array
     """(d, d) P of the cost to go, z P z / 2."""
     rpm: Array
@@ -84,7 +84,7 @@ def feedback(
     params: Params, gain: Float[Array, "4 d"], state: State, target: State, rpm: Float[Array, "4"]
 ) -> Float[Array, "4"]:
     """Command of a reference with feedback of the tracking error, limited, RPM."""
-    return limited(params, rpm - command_unit(params) * (gain @ tracking_error(params, state, target)))
+    return limited(params, rpm - command_unit(params) * (gain @ feedback_error(params, state, target)))
 
 
 def gain(

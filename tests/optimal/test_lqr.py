@@ -13,7 +13,7 @@ from jaxdrones import optimal
 from jaxdrones.control import Setpoint
 from jaxdrones.dynamics.model import PointMass
 from jaxdrones.optimal import lqr
-from jaxdrones.optimal.coordinates import tracking_error
+from jaxdrones.optimal.coordinates import displaced, feedback_error, tracking_error
 from jaxdrones.optimal.problem import hover, posed
 from jaxdrones.status import PlanningError, Status
 
@@ -118,6 +118,61 @@ def test_the_error_of_a_drone_with_a_load_depends_neither_on_the_place_nor_on_th
     np.testing.assert_allclose(there, here, rtol=0, atol=1e-12)
     np.testing.assert_allclose(hanging, swing, rtol=0, atol=1e-12)
     np.testing.assert_allclose(here[16:], [-0.2, -0.1, 0, 0.1, 0.2, 0], rtol=0, atol=1e-12)
+
+
+def test_the_error_of_the_feedback_is_the_tracking_error_to_first_order():
+    params, state = some_state()
+    reference = state.replace(quat=jd.rotation.exp(jnp.array([0.1, -0.2, 0.9])))
+
+    def near(error):
+        return jax.jacfwd(lambda z: error(params, displaced(params, reference, z), reference))(jnp.zeros(16))
+
+    expected, matrix = jit_unoptimized(lambda: (near(tracking_error), near(feedback_error)))()
+    np.testing.assert_allclose(matrix, expected, rtol=0, atol=1e-12)
+
+
+def test_position_and_tilt_enter_the_feedback_alike_whatever_the_heading_of_the_drone():
+    """Thrust acts along the tilt of the body: a drone of another heading sees its own error turned and corrects it."""
+    params, state = some_state()
+    reference, tilt = hover(params, state), jd.rotation.exp(jnp.array([0.2, -0.1, 0.0]))
+
+    @jit_unoptimized
+    def error(angle):
+        turn = jd.rotation.exp(jnp.array([0.0, 0.0, 1.0]) * angle)
+        pos, vel = (jd.rotation.rotate(turn, jnp.array(v)) for v in ([0.2, 0.1, 0.3], [0.5, -0.4, 0.1]))
+        there = state.replace(pos=pos, vel=vel, quat=jd.rotation.multiply(turn, tilt))
+        return feedback_error(params, there, reference)
+
+    expected = error(0.0)
+    for angle in (0.7, 2.3, -3.0, 3.5):
+        z = error(angle)
+        np.testing.assert_allclose(np.delete(z, 5), np.delete(expected, 5), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(z[5], 2 * np.sin((angle + np.pi) % (2 * np.pi) / 2 - np.pi / 2), atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.parametrize("rotors", [jd.instant_rotors, jd.lagging_rotors])
+def test_the_regulator_recovers_from_a_large_error_of_the_heading(rotors):
+    team = team_of("cf2x")
+    params, step = one(team), make_step(rotors=rotors, dt=1 / 400, substeps=4)
+    settings = lqr.settings(step)
+
+    @jax.jit
+    def end(degrees):
+        attitude = jd.rotation.exp(jnp.array([0.0, 0.0, 1.0]) * jnp.radians(degrees))
+        start = one(hovering(team)).replace(pos=jnp.array([0.3, 0.0, 0.0]), quat=attitude)
+
+        def advance(carry, _):
+            memory, state = carry
+            memory, rpm = lqr.control(settings, params, memory, state, Setpoint.at(jnp.zeros((3, 3))), dt=DT)
+            return (memory, one(step(team, jax.tree.map(lambda x: x[None], state), rpm[None]))), None
+
+        start = start.replace(rpm=jnp.broadcast_to(params.hover_rpm, (4,)))
+        (_, state), _ = jax.lax.scan(advance, (lqr.init(settings, params, start), start), length=500)
+        return jnp.linalg.norm(state.pos)
+
+    assert np.all(jax.vmap(end)(jnp.array([0.0, 90.0, 130.0, 150.0, 179.0, -130.0])) < 0.01)
 
 
 @pytest.mark.float32

@@ -272,6 +272,16 @@ def test_arrays_of_a_team_are_refused(loop):
                 loop.control(loop.gains(), *(one_drone | {name: of_a_team}).values(), dt=DT)
 
 
+@pytest.mark.parametrize("loop", [loop for loop in EVERY_CONTROLLER if loop not in VELOCITY], ids=repr)
+def test_set_points_whose_squares_may_exceed_float32_are_refused(loop):
+    """Their directions would be zero without a word, and the memory of an adaptive controller NaN for good."""
+    team, memory, state, target = (one(x, 0) for x in in_flight(loop))
+    for field, number in (("pos", -1e20), ("vel", jnp.nan), ("acc", jnp.inf), ("yaw", 1e15), ("omega", 1e10)):
+        wrong = target.replace(**{field: jnp.full_like(getattr(target, field), number)})
+        with pytest.raises(ValueError, match=rf"^setpoint\.{field} is .*; give finite numbers of at most 1e\+09"):
+            loop.control(loop.gains(), team, memory, state, wrong, dt=DT)
+
+
 def once(control, gains, team, memory, state, target):
     return control_team(control, gains, team, memory, state, target, dt=DT)
 

@@ -131,6 +131,11 @@ class Physics:
         """Whether the rotors have the lag of `lagging_rotors`, also as a part of `pwm_rotors`."""
         return inspect.unwrap(self.rotors) in map(inspect.unwrap, (lagging_rotors, pwm_rotors))
 
+    @property
+    def takes_pwm(self) -> bool:
+        """Whether commands are the PWM of `pwm_rotors`, also inside `failing`, in place of rotor speeds."""
+        return inspect.unwrap(self.rotors) is inspect.unwrap(pwm_rotors)
+
     def check_lag(self, params: Params, dt: float) -> None:
         """Raise for rotors that lag by less than half a physics step (s): their speed would swing ever wider."""
         times = params.rotor_rise_time, params.rotor_fall_time

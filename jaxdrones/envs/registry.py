@@ -6,9 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, cast
-
-import numpy as np
+from typing import Annotated, Any
 
 from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
 from jaxdrones.checks import check_switch, check_vehicle, look_up, short_repr
@@ -17,11 +15,11 @@ from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
-from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import ExplicitStep, make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
+from jaxdrones.envs.action_checks import check_action
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
@@ -143,8 +141,7 @@ def make(
     if disturbance is not None and external_force not in effects:
         effects = [*effects, external_force]
     pairs = _all_named("pairs", task.pairs if pairs is None else pairs, PAIRS, others=EFFECTS)
-    lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
-    action = _action(task.action if action is None else action, nominal, lagging, dt)
+    action = _action(task.action if action is None else action, nominal, rotors, dt)
     sensors = check_sensors(sensors, dt)
     physics: dict[str, Any] = dict(
         effects=effects, pairs=pairs, team_effects=team_effects, models=(*models, *task.models), rotors=rotors
@@ -202,8 +199,6 @@ def make(
 
 
 _MAX_STEPS = 1e9  # control steps of an episode, which are counted by an integer of 32 bits
-_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
-_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
 _PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), randomize=(), noise=None, delay=0.0)
 _REALISTIC: dict[str, Any] = dict(
     rotors="lagging", effects=("drag",), randomize=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
@@ -244,7 +239,7 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
     return look_up(kind, value, table) if isinstance(value, str) else value
 
 
-def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
+def _action(action: str | Action, nominal: Params, rotors: Any, dt: float) -> Action:
     """Action type for the vehicle; raise if its controller is unstable with it."""
     kind = _named("action", action, ACTIONS)
     kind = kind() if isinstance(action, str | type) else kind
@@ -252,7 +247,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
         raise UserError(
             f"action is {short_repr(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
-    _check_controller(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
+    check_action(action if isinstance(action, str) else None, kind, nominal, rotors, dt)
     return dataclasses.replace(kind, name=action if isinstance(action, str) else kind.name).fitted(nominal)
 
 
@@ -280,21 +275,3 @@ def _vision(
     if camera is not None:
         raise UserError("camera is given without vision; give for example vision=('depth',), or leave it out")
     return None
-
-
-def _check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
-    """Raise for a control rate or a rotor lag at which the controller of an action type is unstable."""
-    if action.for_vehicle is None:
-        return
-    if dt > _MAX_PERIOD * (1 + 1e-6):
-        raise UserError(
-            f"control_hz is {1 / dt:g}; the action type {name!r} uses a controller that needs "
-            f"{1 / _MAX_PERIOD:g} or more"
-        )
-    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
-    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
-        raise UserError(
-            f"the action type {name!r} uses a controller that needs rotors with a time constant of up to "
-            f"{_MAX_ROTOR_TIME} s; this vehicle has {time:.2g} s; give rotors='instant', or an "
-            "action type that commands rotors, thrust and torques, or rates"
-        )

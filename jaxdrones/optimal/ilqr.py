@@ -16,7 +16,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_weights, hover, posed
+from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_step, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -72,7 +72,7 @@ def settings(step: Any, weights: Weights | None = None, horizon: Horizon = 25, i
     The terminal cost after `horizon` control steps, at least two, is that of the regulator of `lqr`. The `iterations`
     of a call of `control` start from the previous plan.
     """
-    return Settings(checked_weights(weights), step, horizon, iterations=iterations)
+    return Settings(checked_weights(weights), checked_step(step), horizon, iterations=iterations)
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:

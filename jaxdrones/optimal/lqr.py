@@ -12,7 +12,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.optimal.coordinates import command_unit, feedback_error, linearize_step, single
-from jaxdrones.optimal.problem import Weights, checked_weights, hover, posed
+from jaxdrones.optimal.problem import Weights, checked_step, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -46,7 +46,7 @@ class Memory(PyTreeNode):
 
 def settings(step: Any, weights: Weights | None = None) -> Settings:
     """Settings of a regulator, with the weights of the errors, by default `problem.weights()`."""
-    return Settings(checked_weights(weights), step)
+    return Settings(checked_weights(weights), checked_step(step))
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:

@@ -13,7 +13,7 @@ from jaxdrones.control.single import OneState
 from jaxdrones.optimal.coordinates import tracking_error
 from jaxdrones.optimal.interpreter import on_symbols
 from jaxdrones.optimal.primitives import casadi
-from jaxdrones.optimal.problem import Horizon, Weights, check_plan, checked_weights, reference
+from jaxdrones.optimal.problem import Horizon, Weights, check_plan, checked_weights, reference, refuse_pwm
 from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -57,8 +57,9 @@ class Mpc:
             solver: a name of `SOLVERS`.
 
         Raises:
-            ValueError: a model of a team, or an unknown solver.
+            ValueError: a model of a team, a model whose commands are PWM, or an unknown solver.
         """
+        refuse_pwm("model", model.takes_pwm)
         check_shape("model.params.mass", model.params.mass, (), "Mpc controls one drone; make one for each")
         self.model, self.horizon, self._dt = model, horizon, dt
         self.seconds = float("nan")

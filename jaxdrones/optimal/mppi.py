@@ -19,7 +19,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_weights, hover, posed
+from jaxdrones.optimal.problem import Horizon, Reference, Weights, checked_step, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -71,7 +71,7 @@ def settings(
     """
     return Settings(
         checked_weights(weights),
-        step,
+        checked_step(step),
         horizon,
         noise=jnp.array([0.05, 0.02, 0.02, 0.02]),
         temperature=jnp.asarray(temperature, float),

@@ -82,6 +82,26 @@ def checked_weights(given: Weights | None) -> Weights:
     return given
 
 
+def checked_step(step: Any) -> Any:
+    """Step of a planner, which commands rotor speeds.
+
+    Raises:
+        ValueError: a step whose commands are PWM.
+    """
+    if (physics := getattr(step, "physics", None)) is not None:
+        refuse_pwm("step", physics.takes_pwm)
+    return step
+
+
+def refuse_pwm(name: str, takes_pwm: bool) -> None:
+    """Raise if the commands of a model are PWM."""
+    if takes_pwm:
+        raise UserError(
+            f"{name} takes the PWM of pwm_rotors, and planners command rotor speeds, RPM; give a model with "
+            "rotors=jaxdrones.lagging_rotors, and convert its commands with jaxdrones.pwm_of_thrust"
+        )
+
+
 class Reference(PyTreeNode):
     """Reference motion at H + 1 control steps."""
 

@@ -38,7 +38,7 @@ class CasadiModel:
     x: Any
     """(nx,) `casadi.SX`, the state: see `names`."""
     u: Any
-    """(4 n,) `casadi.SX`, commanded rotor speeds, RPM, drone after drone."""
+    """(4 n,) `casadi.SX`, commanded rotor speeds, RPM, or PWM of `pwm_rotors`, drone after drone."""
     p: Any
     """(np,) `casadi.SX`, symbolic constants: see `parameter_names`."""
     xdot: Any
@@ -51,6 +51,8 @@ class CasadiModel:
     """(np) entries of p."""
     start: State
     """State of the same structure, NumPy arrays: level, at rest at the origin."""
+    takes_pwm: bool = False
+    """Whether `u` is PWM."""
 
     def vector(self, state: State) -> np.ndarray:
         """(nx,) vector of a state, in the order of `names`."""
@@ -121,7 +123,8 @@ def casadi_model(
         n = len(team.mass)
         derivative = make_derivative(effects, pairs, team_effects, models, rotors)
         at_rest = State.at_rest(jnp.zeros((n, 3)))
-        start = Physics(effects, pairs, team_effects, models, rotors).init(team, at_rest)
+        physics = Physics(effects, pairs, team_effects, models, rotors)
+        start = physics.init(team, at_rest)
 
         def rate(state: State, command: Any, chosen: dict[str, Any]) -> State:
             return derivative(team.replace(**chosen), state, command, scene)
@@ -133,7 +136,7 @@ def casadi_model(
         params, start = jax.device_get((params, start))
     given, labels = ([x, u, p], ["x", "u", "p"]) if parameters else ([x, u], ["x", "u"])
     function = casadi.Function("f", given, [xdot], labels, ["xdot"])
-    return CasadiModel(function, x, u, p, xdot, params, _names(start), _names(chosen), start)
+    return CasadiModel(function, x, u, p, xdot, params, _names(start), _names(chosen), start, physics.takes_pwm)
 
 
 def _as_double(leaf: Any) -> Any:

@@ -124,6 +124,7 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(effects=("downwash",)), r"'downwash' is given as one of effects; .* give pairs=\('downwash',\)"),
         (dict(pairs=("drag",)), r"'drag' is given as one of pairs; .* give effects=\('drag',\)"),
         (dict(effects=(jd.downwash,)), r"effects: downwash takes .*; give a function of \(params, state\)"),
+        (dict(rotors=jd.failing(jd.pwm_rotors)), r"rotors take PWM, and the action type 'rpm' commands rotor speeds"),
         (dict(vehicle=5), r"vehicle is 5; give"),
         (dict(vehicle=jd.repeat(CF2X, 2)), r"mass has shape \(2,\).*single drone"),
         (dict(vehicle=CF2X.replace(mass=-1)), r"params\.mass is -1; give positive numbers"),
@@ -131,7 +132,7 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(vehicle=CF2X.replace(inertia=[1e-5, 1e-5, 2e-5])), r"params\.inertia is \[1e-05.*; give an array"),
         (dict(vehicle=CF2X.replace(kf=jnp.nan)), r"params\.kf is not finite"),
     ],
-    ids=range(22),
+    ids=range(23),
 )
 def test_a_mistake_in_an_option_is_named(options, message):
     with pytest.raises(ValueError, match=message):

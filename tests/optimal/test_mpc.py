@@ -105,6 +105,9 @@ def test_what_does_not_fit_is_refused():
             Mpc(model(), **({"dt": DT} | {option: value}))
     with pytest.raises(ValueError, match="make one for each"):
         Mpc(casadi_model(team), DT)
+    with_motors = one(team).replace(aux={"motors": jd.crazyflie_motors()})
+    with pytest.raises(ValueError, match="model takes the PWM of pwm_rotors"):
+        Mpc(casadi_model(with_motors, rotors=jd.pwm_rotors), DT)
     mpc, one_drone = controller(horizon=4), team_of("cf2x")
     with pytest.raises(ValueError, match=r"setpoints.pos has shape \(3, 3\); expected \(5, 3\)"):
         mpc(one(hovering(one_drone)), Setpoint.at(jnp.zeros((3, 3))))

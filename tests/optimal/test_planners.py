@@ -126,6 +126,15 @@ def test_settings_that_make_no_sense_are_refused(module, option, least):
     assert getattr(module.settings(_step(), **{option: least}), option) == least
 
 
+@pytest.mark.parametrize("rotors", [jd.pwm_rotors, jd.failing(jd.pwm_rotors)])
+def test_a_step_that_takes_pwm_is_refused(rotors):
+    """The planners' commands are RPM."""
+    step = jd.make_step(rotors=rotors, dt=DT)
+    for module in (lqr, ilqr, mppi):
+        with pytest.raises(ValueError, match=r"step takes the PWM .*; give a model with rotors=jaxdrones.lagging"):
+            module.settings(step)
+
+
 @pytest.mark.slow
 def test_setpoints_that_do_not_fit_the_horizon_are_refused():
     team = team_of("cf2x")

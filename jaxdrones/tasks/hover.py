@@ -162,9 +162,13 @@ def landing(
 
 
 def settled(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
+    """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds.
+
+    It was not in an episode of fewer control steps.
+    """
     steps = round(SETTLED / dt)
-    return jnp.all((metrics["error"][-steps:] < 0.05) & (metrics["speed"][-steps:] < 0.1), axis=0)
+    near = (metrics["error"][-steps:] < 0.05) & (metrics["speed"][-steps:] < 0.1)
+    return jnp.all(near, axis=0) & (len(near) >= steps)
 
 
 def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -95,6 +95,13 @@ def test_an_episode_no_longer_than_what_its_criterion_leaves_out_is_judged_by_it
     assert jnp.all(succeeds(good)) and not jnp.any(succeeds(bad))
 
 
+def test_a_hover_of_less_than_two_seconds_is_no_success():
+    """An environment with fewer steps than its task has the criterion of the task."""
+    task, still = TASKS["hover"](), jnp.zeros((200, 1))
+    for steps, success in (200, True), (199, False), (50, False):
+        assert task.success({"error": still[:steps], "speed": still[:steps]}, 0.01).tolist() == [success]
+
+
 @pytest.mark.parametrize("name", [*HEIGHTS, "fly-through-gate", "tune", "meetup", "gates"])
 def test_starts_are_one_unless_a_spread_is_given(name):
     """Every drone has a start of its own, within the spread, and what the task keeps of the start is the same."""

@@ -5,6 +5,7 @@ import contextlib
 import csv
 import io
 import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from helpers import SMALL_OPTIONS
 
-from jaxdrones.cli import main, make_parser
+from jaxdrones.cli import main, make_parser, train_request
 from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
 from jaxdrones.cli.settings import parse_settings, with_config
@@ -22,6 +23,7 @@ from jaxdrones.cli.train_request import Request
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training import trainer
+from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run, report_as_dict
 
 pytestmark = pytest.mark.float32
@@ -179,6 +181,17 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
     assert after["notes.txt"] == b"of other people" and after["best.msgpack"] != before["best.msgpack"]
     assert Run(folder).sidecar_entry("state", "seed") == 5 and Run(folder).report()["updates"] == 4
     assert [row["update"] for row in Run(folder).history()] == [0, 1, 2, 3, 4]
+
+
+def test_a_policy_of_another_vehicle_than_that_of_the_training_is_named(capsys, monkeypatch):
+    """--from keeps its parameters only."""
+    run = argparse.Namespace(recipe=lambda: Recipe.of("hover", vehicle="racer"), policy=lambda: None)
+    monkeypatch.setattr(train_request, "open_policy", lambda *_: run)
+    for options, warned in ([], True), (["--vehicle", "racer"], False), (["--vehicle", "hb"], False):
+        options = make_parser().parse_args(["train", "hover", "--from", "runs/racer", *options])
+        Request.of(options).first_policy()
+        warning = "runs/racer was trained with the vehicle racer, .* this training is with cf2x; give --vehicle racer"
+        assert bool(re.search(warning, capsys.readouterr().err)) == warned
 
 
 @pytest.mark.slow
@@ -385,6 +398,9 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         assert [row["update"] for row in run.history()] == [0, 1]
     assert "hover by bptt, duration 0.2, horizon=2: 4 worlds x 2 control steps" in capsys.readouterr().out
     assert main(command) == 2 and "horizon=2 holds a finished training" in capsys.readouterr().err
+    assert main([*command, "--overwrite", "--json"]) == 0
+    results = json.loads(capsys.readouterr().out)["runs"]
+    assert [Path(result["output"]).name for result in results] == ["horizon=2", "horizon=4"]
 
 
 @pytest.mark.parametrize(

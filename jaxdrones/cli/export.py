@@ -4,7 +4,7 @@ import argparse
 
 from jaxdrones.arguments import choice
 from jaxdrones.cli.common import run_folder
-from jaxdrones.cli.options import add_drones, add_output, option, switch
+from jaxdrones.cli.options import Once, add_drones, add_output, option, switch
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import given_settings
@@ -21,7 +21,7 @@ def add(commands) -> None:
         "and outputs: order, unit, frame and range.",
     )
     add_drones(add_policy(parser))
-    option(parser, "--to TARGET", "{}", check=choice("target", TARGETS), known=TARGETS, required=True)
+    option(parser, "--to TARGET", "{}", check=choice("target", TARGETS), known=TARGETS, required=True, action=Once)
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     switch(parser, "--last", "export the newest policy instead of the best")

@@ -1,5 +1,6 @@
 """Options shared by several commands, with one meaning and one help text each."""
 
+import argparse
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,15 @@ def option(
     vars(added)["known"] = list(known)
     if check is not None:
         group.set_defaults(ranges=(group.get_default("ranges") or {}) | {added.dest: check})
+
+
+class Once(argparse.Action):
+    """Value of an option that may be given once only, where a second value might be meant in addition."""
+
+    def __call__(self, parser, namespace, values, option_string=None):  # noqa: D102
+        if getattr(namespace, self.dest) != self.default:
+            parser.error(f"argument {option_string}: {getattr(namespace, self.dest)} and {values} are given; give one")
+        setattr(namespace, self.dest, values)
 
 
 def switch(group, name: str, text: str) -> None:

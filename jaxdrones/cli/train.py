@@ -15,7 +15,7 @@ from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.live import add_live, live_server, show_training
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle, option, switch
-from jaxdrones.cli.report import described
+from jaxdrones.cli.report import as_json, described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
@@ -83,7 +83,8 @@ def add(commands) -> None:
     option(
         schedule,
         "--from RUN",
-        "start from the best policy of a run or a bundled one, with a new optimizer, not from random parameters",
+        "start from the best policy of a run or a bundled one, with a new optimizer, not from random parameters; "
+        "vehicle and options are those of this command, not of RUN",
         folder,
         dest="start_from",
     )
@@ -155,15 +156,19 @@ def _train(options: argparse.Namespace) -> int:
         for request in requests if len(requests) > 1 else ():  # a mistake in the last one is found before the first
             with user_mistakes(request.settings, request.task):
                 request.recipe(request.runs())
+    results: list[dict[str, Any]] = []  # with --json
+    code = 0
     for request in requests:
-        code = _train_row(request, begin)
+        code = _train_row(request, begin, results)
         if code:
-            return code
+            break
         begin = time.perf_counter()
-    return 0
+    if options.json and results:
+        print(as_json({"runs": results} if options.sweep else results[0]))
+    return code
 
 
-def _train_row(request: Request, begin: float) -> int:
+def _train_row(request: Request, begin: float, results: list) -> int:
     with contextlib.ExitStack() as stack:
         with fail_together():
             for folder in dict.fromkeys((request.output, *request.folders.values())):
@@ -176,10 +181,12 @@ def _train_row(request: Request, begin: float) -> int:
                     loop.check_resumable(trainer, run)
             for run in (*runs.values(), Run(request.output)):
                 run.prepare(trainer.disk_size)
-        return _train_runs(request, runs, trainer, train_output.Deadlines(request, begin))
+        return _train_runs(request, runs, trainer, train_output.Deadlines(request, begin), results)
 
 
-def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines) -> int:
+def _train_runs(
+    request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines, results: list[dict[str, Any]]
+) -> int:
     print_line = train_output.quiet if request.json else print
     config, what = trainer.recipe.config, described(trainer.recipe) + f", {request.row}" * bool(request.row)
     _compile(request, runs, trainer, what, print_line)
@@ -205,9 +212,9 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
             except Diverged as error:
                 train_output.draw_curves(request, {seed: run}, run.folder)
                 return print_error(f"training diverged: {error}; {train_output.remaining_best(run)}", 1)
-    code = train_output.show_results(request, runs)
+    results.append(train_output.show_results(request, runs))
     deadlines.warn_if_missed()
-    return code
+    return 0
 
 
 def _compile(request: Request, runs: dict, trainer: Any, what: str, print_line: Callable) -> None:

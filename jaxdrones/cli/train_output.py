@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import bar, print_warning
-from jaxdrones.cli.report import as_json, evaluation_table, percent
+from jaxdrones.cli.report import evaluation_table, percent
 from jaxdrones.cli.train_request import Request
 from jaxdrones.learning.evaluation import score_of, wilson_interval
 from jaxdrones.training.plan import best_of
@@ -147,8 +147,8 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
     return [folder / "curve.png"]
 
 
-def show_results(request: Request, runs: dict) -> int:
-    """Draw learning curves, choose the best seed, and print the results."""
+def show_results(request: Request, runs: dict) -> dict[str, Any]:
+    """Draw learning curves, choose the best seed, and print the results unless with --json; return them."""
     output = request.output
     reports = {seed: run.report() for seed, run in runs.items()}
     evaluations = [report["evaluation"] for report in reports.values()]
@@ -161,16 +161,20 @@ def show_results(request: Request, runs: dict) -> int:
         Run(output).save_policy("best", run.policy(), **about)
         Run(output).save_report({"run_id": about["run_id"], "best_seed": best, "seeds": list(reports.values())})
     files = [output / "best.msgpack", output / "report.json", *draw_curves(request, runs, output)]
-    if request.json:
-        result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
-        print(as_json(result | {"files": list(map(str, files))}))
-        warn_of_failure(run, reports[best])
-        return 0
+    if not request.json:
+        _print_results(output, runs, reports, files)
+    warn_of_failure(run, reports[best])
+    result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
+    return result | {"files": list(map(str, files))}
+
+
+def _print_results(output: Path, runs: dict, reports: dict[int, dict[str, Any]], files: list[Path]) -> None:
     for seed, report in reports.items():
         spent = report["seconds"]
         early = ""
         if report["stopped_at_success"]:
-            early = f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"
+            stop_at = runs[seed].recipe("last").stop_at
+            early = f"; stopped at update {report['updates']}, success {stop_at:g} was reached"
         if len(runs) > 1:
             print(f"seed {seed}:")
         print(
@@ -181,5 +185,3 @@ def show_results(request: Request, runs: dict) -> int:
         print(evaluation_table(report["evaluation"]))
     print("wrote " + ", ".join(map(str, files)))
     print(f"fly it: {shlex.join(['jaxdrones', 'fly', '--policy', str(output)])}")
-    warn_of_failure(run, reports[best])
-    return 0

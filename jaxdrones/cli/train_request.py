@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from jaxdrones import arguments
-from jaxdrones.cli.common import run_folder
+from jaxdrones.cli.common import print_warning, run_folder
 from jaxdrones.cli.policies import is_user_policy, open_policy, warn_of_code
 from jaxdrones.cli.settings import given_settings, parse_value
 from jaxdrones.errors import UserError
@@ -113,7 +113,14 @@ class Request(argparse.Namespace):
             return None
         if is_user_policy(self.start_from):
             raise UserError(f"--from is {self.start_from}; give the folder of a run or the name of a bundled policy")
-        return open_policy(self.start_from, None, False, {}).policy()
+        run = open_policy(self.start_from, None, False, {})
+        had = run.recipe().options.get("vehicle", "cf2x")
+        if "vehicle" not in self.settings and self.realistic != "any" and had != "cf2x":
+            print_warning(
+                f"the policy of {self.start_from} was trained with the vehicle {had}, and --from keeps only its "
+                f"parameters: this training is with cf2x; give --vehicle {had} for the same"
+            )
+        return run.policy()
 
     def _new_recipe(self, runs: dict):
         algorithm = default_algorithm(self.task) if self.algo is None else self.algo

@@ -40,12 +40,23 @@ def _check_range(field: str, low: float, high: float, **limit: Any) -> None:
 
 @checked
 def scaled(field: Field, low: float, high: float) -> Randomization:
-    """Nominal value times U(low, high), one factor for the whole array."""
+    """Nominal value times U(low, high), one factor for the whole array.
+
+    A vehicle whose coefficient is zero, so that no factor changes it, is an error.
+    """
+    return _scaled(field, low, high)
+
+
+def _scaled(field: str, low: float, high: float, zero: bool = False) -> Randomization:
+    """`scaled`; `zero` allows a coefficient that is zero, as another randomization may set wind and force."""
     limit = {"above": 0} if field in POSITIVE else {"at_least": 0} if field in NOT_NEGATIVE else {}
     _check_range(field, low, high, **limit)
 
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
+        zeros = field not in ("wind", "external_force") and is_concrete(value) and not np.any(np.asarray(value))
+        if zeros and not zero:
+            raise UserError(f"{field} of the vehicle is zero, and {field} times U({low:g}, {high:g}) too; leave it out")
         return params.replace(**{field: value * jax.random.uniform(key, (), value.dtype, low, high)})
 
     return described(f"{field} times U({low:g}, {high:g})", randomize)
@@ -267,8 +278,11 @@ _LAGS = "rotor_rise_time", "rotor_fall_time"
 
 
 def realistic_randomization(**ranges: tuple[float, float]) -> tuple[Randomization, ...]:
-    """`REALISTIC_RANDOMIZATION` with other ranges of some parameters: name=(low, high), relative to nominal values."""
-    return tuple(scaled(name, *bounds) for name, bounds in (_RANGES | ranges).items())
+    """`REALISTIC_RANDOMIZATION` with other ranges of some parameters: name=(low, high), relative to nominal values.
+
+    A coefficient that is zero stays zero.
+    """
+    return tuple(_scaled(name, *bounds, zero=True) for name, bounds in (_RANGES | ranges).items())
 
 
 REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = realistic_randomization()

@@ -113,6 +113,10 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(pairs="downwash"), r"pairs is 'downwash'; give a sequence"),
         (dict(vision="rgb"), r"vision is 'rgb'; give a sequence, for example \('depth',\)"),
         (dict(randomize=scaled("mass", 0.9, 1.1)), r"randomize is .*; give a sequence"),
+        (
+            dict(vehicle="hb", effects=("drag",), randomize=(scaled("drag_coeff", 0.5, 1.5),)),
+            r"drag_coeff of the vehicle is zero, .*; leave it out",
+        ),
         (dict(randomize=("mass",)), r"randomize: 'mass' is not a function"),
         (dict(randomize=(lambda params: params,)), r"randomize: <lambda> takes .*; give a function of \(key, params\)"),
         (dict(scene=lambda: 3), r"scene: <lambda> takes \(\); give a function of \(key\)"),
@@ -132,7 +136,7 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(vehicle=CF2X.replace(inertia=[1e-5, 1e-5, 2e-5])), r"params\.inertia is \[1e-05.*; give an array"),
         (dict(vehicle=CF2X.replace(kf=jnp.nan)), r"params\.kf is not finite"),
     ],
-    ids=range(23),
+    ids=range(24),
 )
 def test_a_mistake_in_an_option_is_named(options, message):
     with pytest.raises(ValueError, match=message):

@@ -16,9 +16,8 @@ from jaxdrones.checks import NOT_NEGATIVE, POSITIVE, check_number, is_concrete, 
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
-from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.tasks.task import Randomization, Task
+from jaxdrones.tasks.task import Randomization
 
 _DRAWS = 1000
 DELAY = "delay"
@@ -124,19 +123,6 @@ def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params
     for one in randomize:
         params = one.median(params) if isinstance(one, AnyVehicle) else params
     return params
-
-
-def check_starts(randomize: Sequence[Randomization], task: Task, params: Params, scene: Scene) -> None:
-    """Raise if the drones of a team would start in each other with the largest vehicle that an episode may draw."""
-    heaviest = next((one.heaviest for one in randomize if isinstance(one, AnyVehicle)), None)
-    if heaviest is None or len(params.mass) == 1:
-        return
-    radius = jnp.full_like(params.collision_radius, vehicles.largest_radius(heaviest))
-    widest = params.replace(collision_radius=radius)
-    try:
-        jax.eval_shape(lambda key, scene: task.begin(key, widest, scene, 1.0), jax.random.key(0), scene)
-    except UserError as error:
-        raise UserError(f"with AnyVehicle(heaviest={heaviest:g}) {error}") from None
 
 
 def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:

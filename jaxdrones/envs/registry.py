@@ -33,12 +33,12 @@ from jaxdrones.envs.randomize import (
     Noise,
     Randomization,
     all_randomizations,
-    check_starts,
     delay_bounds,
     nominal_params,
     sensor_noise,
     with_random_lags,
 )
+from jaxdrones.envs.start_checks import check_free_starts, check_starts
 from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params, repeat
@@ -147,7 +147,7 @@ def make(
         effects=effects, pairs=pairs, team_effects=team_effects, models=(*models, *task.models), rotors=rotors
     )
     physics |= dict(dt=dt / substeps, substeps=substeps)
-    scene = task.scene if scene is None else scene
+    given_scene, scene = scene, task.scene if scene is None else scene
     example = scene_example(scene)
     check_starts(randomize, task, nominal, example)
     step: Step
@@ -193,6 +193,8 @@ def make(
             f"{_MAX_STEPS:.0e}"
         )
     assert made.term_sizes  # checks the functions of the task
+    if isinstance(given_scene, Scene):
+        check_free_starts(task, nominal, given_scene)
     if isinstance(step, ExplicitStep) and step.physics.rotors_lag:
         step.check_lag(with_random_lags(randomize, nominal))
     return made

@@ -14,6 +14,7 @@ from jaxdrones.envs import TASKS, AutoReset, make
 from jaxdrones.envs.disturbances import random_pushes
 from jaxdrones.envs.randomize import AnyVehicle, constant_wind, scaled, sensor_noise, shifted
 from jaxdrones.learning import evaluate
+from jaxdrones.sensing import Box, Scene
 from jaxdrones.tasks.curves import circle
 from jaxdrones.tasks.hover import hover
 from jaxdrones.tasks.task import ObservationTerm
@@ -82,6 +83,15 @@ def test_drones_that_would_start_in_each_other_are_refused(task):
     assert make(task, **drones)
     with pytest.raises(ValueError, match=r"drones of this vehicle are 0\.76 m wide and would start in each other"):
         make(task, vehicle="x500", **drones)
+
+
+def test_a_scene_in_which_every_start_is_inside_an_obstacle_is_refused():
+    def cube(x, half):
+        return Scene.of(Box(pos=jnp.array([x, 0.0, 2.0]), size=jnp.full(3, 2 * half)))
+
+    assert make("hover", scene=cube(0.0, 0.2)) and make("hover", scene=cube(2.0, 0.5))
+    with pytest.raises(ValueError, match=r"^scene: in each of 16 starts of hover a drone is inside an obstacle; move"):
+        make("hover", scene=cube(0.0, 1.01))
 
 
 @pytest.mark.parametrize("option", ["control_hz", "substeps", "delay", "realistic"])

@@ -136,13 +136,15 @@ class Node:
             return
         self.flown.received += 1
         self._flight.commands[i] = command
-        if self._watches[i].hear(self._clock()) and not self._lockstep:
+        if self._watches[i].hear(self._clock()):
             self._warn(f"commands for {topics.drone(i)} arrive; it follows them")
 
     def _answer(self) -> tuple[bool, str]:
         """Step service: one control step; the answer has the simulated time."""
         if self._stepper.hear(self._clock()):
             self._warn("the step service is called again; the flight is in lockstep")
+            for watch in self._watches:
+                watch.lost = False
         self._step()
         now = convert.stamp(self._flight.ns)
         return True, f"{now.sec}.{now.nanosec:09d}"
@@ -154,7 +156,8 @@ class Node:
             silent = f"the step service was not called for {self._stepper.limit:g} s"
             self._give_up(silent, "the flight continues by the clock")
             self._due = self._clock()
-            for i in range(self._flight.drones):
+            for i, watch in enumerate(self._watches):
+                watch.lost = True  # until a command arrives, which is followed by the clock
                 self._flight.commands[i] = hover(self._flight.commands[i], self._flight.state, i)
 
     def _await_clock(self) -> None:
@@ -177,12 +180,12 @@ class Node:
         flight, now = self._flight, self._clock()
         down = 0
         for i, watch in enumerate(self._watches):
-            if not self._lockstep and watch.lose(now):
+            if watch.lose(now):
                 self.flown.lost += 1
                 silent = f"no command for {topics.drone(i)} for {watch.limit:g} s"
                 self._give_up(silent, f"it {self._failsafe.action}s")
                 flight.commands[i] = hover(flight.commands[i], flight.state, i)
-            if self._failsafe.action == "land" and (watch.lost or self._lockstep):
+            if self._failsafe.action == "land" and watch.lost:
                 flight.commands[i] = sink(flight.commands[i], flight.params, flight.state, i, dt)
                 down += int(flight.commands[i].mode == Mode.MOTORS)
         self.flown.landed = down == flight.drones

@@ -155,6 +155,26 @@ def test_without_calls_of_the_step_service_the_failsafe_acts(action):
     assert warnings == ["the step service was not called for 0.5 s; the flight continues by the clock"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("action", ["hover", "land"])
+def test_without_calls_of_the_step_service_commands_are_followed_by_the_clock(action):
+    """Rotor speeds do not stop the rotors of a drone in the air, and a landing begins where the commands end."""
+    wire = Wire()
+    node, warnings = make_node(wire, n=1, lockstep=True, failsafe=Failsafe(action, timeout=0.3, wait=0.1))
+    hover = float(node._flight.params.hover_rpm[0])
+    peer, message = Peer(wire, 1), convert.motors(np.full(4, hover))
+    wire.script = [(0.2 + 0.05 * k, lambda: peer.send(0, "cmd_motors", message)) for k in range(20)]
+    flown = node.run(5.0)
+    z = np.array([p.z for p in positions(wire, 0)])
+    assert len(z) > 130 and np.all(np.abs(z[:130] - 1.0) < 0.15)  # it keeps the velocity of a landing of 0.1 s
+    assert flown.landed == (action == "land") and (z[-1] < 0.06) == (action == "land")
+    assert warnings == [
+        "the step service was not called for 0.1 s; the flight continues by the clock",
+        "commands for drone_0 arrive; it follows them",
+        f"no command for drone_0 for 0.3 s; it {action}s",
+    ]
+
+
 @pytest.mark.parametrize("action", mostly_slow(["hover", "stop"], ["stop"]))
 def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
     wire = Wire()

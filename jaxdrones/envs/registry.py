@@ -41,7 +41,7 @@ from jaxdrones.envs.randomize import (
 from jaxdrones.envs.start_checks import check_free_starts, check_starts
 from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.errors import UserError
-from jaxdrones.params import Params, repeat
+from jaxdrones.params import Params, check_single, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
 from jaxdrones.tasks.task import ObservationTerm, Task
@@ -127,7 +127,9 @@ def make(
         randomize = preset["randomize"]
     randomize = all_randomizations(realistic == "any", task.randomize, randomize or (), vehicle)
     vehicle = "cf2x" if vehicle is None else vehicle
-    nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
+    nominal = load_params(vehicle) if not isinstance(vehicle, Params) else vehicle
+    check_single("vehicle.mass", nominal, "vehicle is a single drone, and all drones of the task are equal to it")
+    nominal = repeat(nominal, task.drones)
     check_vehicle(nominal)
     nominal = equipped(task, nominal_params(randomize, nominal))
     if "payload" in nominal.aux and any(isinstance(one, AnyVehicle) for one in randomize):

@@ -140,7 +140,7 @@ def test_loads_are_not_for_random_vehicles(task):
         (dict(effects=(jd.downwash,)), r"effects: downwash takes .*; give a function of \(params, state\)"),
         (dict(rotors=jd.failing(jd.pwm_rotors)), r"rotors take PWM, and the action type 'rpm' commands rotor speeds"),
         (dict(vehicle=5), r"vehicle is 5; give"),
-        (dict(vehicle=jd.repeat(CF2X, 2)), r"mass has shape \(2,\).*single drone"),
+        (dict(vehicle=jd.repeat(CF2X, 2)), r"vehicle.mass has shape \(2,\); expected \(\): vehicle is a single drone"),
         (dict(vehicle=CF2X.replace(mass=-1)), r"params\.mass is -1; give positive numbers"),
         (dict(vehicle=CF2X.replace(mass=jnp.array(0.0))), r"params\.mass is 0.0; give positive numbers"),
         (dict(vehicle=CF2X.replace(inertia=[1e-5, 1e-5, 2e-5])), r"params\.inertia is \[1e-05.*; give an array"),

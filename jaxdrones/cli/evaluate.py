@@ -57,6 +57,6 @@ def _evaluate(options: argparse.Namespace) -> int:
         what = "the mean return is not finite, so actions, states or rewards are not"
         return print_error(f"{what}; call the policy with an observation, and test the task by check_env", DIVERGED)
     if options.fail_below is not None and report["success"] < options.fail_below:
-        rate = percent(report["success"], options.episodes)
+        rate = percent(report["success"], report["trials"])
         return print_error(f"the success rate is {rate}, below --fail-below {options.fail_below:g}", DIVERGED)
     return 0

@@ -90,8 +90,8 @@ def described(recipe, **more: Any) -> str:
 
 def evaluation_table(report: dict) -> str:
     """Table of the entries of `report_as_dict`."""
-    episodes, error = report["episodes"], report["final_error_percentiles"]
-    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
+    trials, error = trials_of(report), report["final_error_percentiles"]
+    ends = ", ".join(f"{name} {percent(share, trials)}" for name, share in report["end_rates"].items()) or "none"
     others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
     rows = [
         ["episodes", f"{_counted(report)}, {report['mean_length']:.2f} s long on average"],
@@ -112,13 +112,19 @@ def success(report: dict) -> str:
     """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
     if report["success"] is None:
         return "the task has no criterion of success"
-    episodes, interval = report["episodes"], report["success_interval"]
-    rate = f"{percent(report['success'], episodes)}, {round(report['success'] * episodes):,} of {episodes:,}"
+    trials, interval = trials_of(report), report["success_interval"]
+    rate = f"{percent(report['success'], trials)}, {round(report['success'] * trials):,} of {trials:,}"
+    rate += " drones" * (trials != report["episodes"])
     if interval is None:
         return f"{rate}, one distinct episode without an interval"
     low, high = (100 * x for x in interval)
-    digits = _digits(episodes) + 1
+    digits = _digits(trials) + 1
     return f"{rate}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
+
+
+def trials_of(report: dict) -> int:
+    """Number of episodes, or of drones in a task whose drones end one by one; see `Report.trials`."""
+    return report.get("trials", report["episodes"])
 
 
 def _counted(report: dict) -> str:
@@ -130,14 +136,14 @@ def _counted(report: dict) -> str:
     return f"{episodes:,}, {repeated}"
 
 
-def percent(share: float, episodes: int) -> str:
-    """Fraction of the episodes in percent, with enough digits to resolve one episode."""
-    return f"{100 * share:.{_digits(episodes)}f} %"
+def percent(share: float, trials: int) -> str:
+    """Fraction of trials, such as episodes, in percent, with enough digits to resolve one of them."""
+    return f"{100 * share:.{_digits(trials)}f} %"
 
 
-def _digits(episodes: int) -> int:
-    """Decimals of a percentage that resolve one episode."""
-    return max(1, math.ceil(math.log10(episodes)) - 2)
+def _digits(trials: int) -> int:
+    """Decimals of a percentage that resolve one trial."""
+    return max(1, math.ceil(math.log10(trials)) - 2)
 
 
 def _length(x: float) -> str:

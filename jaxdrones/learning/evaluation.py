@@ -34,6 +34,9 @@ class Report(PyTreeNode):
     episodes: int
     distinct_episodes: int
     """Number of distinct episodes, by start or random draws; 1 if all are the same flight."""
+    trials: int
+    """Number of the trials of which `success` and `end_rates` are fractions: the episodes, or in a task with
+    `ends="drone"` the drones in all episodes."""
     success: float | None
     """Fraction of the episodes without a failure in which every drone met the task's criterion of success, or of such
     drones in a task with `ends="drone"`; `None` for a task without a criterion."""
@@ -221,6 +224,7 @@ def _report(env: Env, outcomes: dict) -> Report:
     return Report(
         episodes=episodes,
         distinct_episodes=distinct,
+        trials=episodes * (env.drones if env.task.ends == "drone" else 1),
         success=success,
         success_interval=None if success is None or distinct == 1 else _interval(outcomes["success"], distinct),
         final_error=float(np.mean(error)),

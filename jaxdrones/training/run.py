@@ -223,7 +223,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 def report_as_dict(report: Report) -> dict[str, Any]:
     """Evaluation for JSON."""
     entries = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
-    entries |= {"successes": None if report.success is None else round(report.success * report.episodes)}
+    entries |= {"successes": None if report.success is None else round(report.success * report.trials)}
     percentiles = {str(q): x for q, x in report.final_error_percentiles.items()}
     return entries | {"final_error_percentiles": percentiles}
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
+from jaxdrones.cli.report import success as described_success
 from jaxdrones.control import Setpoint
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
@@ -22,6 +23,7 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.tasks.shaping import alive
 from jaxdrones.tasks.starts import hovering
 from jaxdrones.tasks.task import Task
+from jaxdrones.training.run import report_as_dict
 
 
 def test_wilson_interval_against_known_numbers():
@@ -110,6 +112,15 @@ def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succe
     errors = np.abs(climb) * np.arange(1, steps + 1)
     np.testing.assert_allclose(report.final_error, errors[-1], atol=1e-6)
     np.testing.assert_allclose(report.rms_error, np.sqrt(np.mean(errors[steps // 5 :] ** 2)), atol=1e-6)
+
+
+@pytest.mark.parametrize(("ends", "successes", "trials"), [("team", 0, 3), ("drone", 3, 6)])
+def test_successes_are_counted_in_episodes_or_in_drones_that_end_alone(ends, successes, trials):
+    """One of two drones falls in each of three episodes."""
+    env = lift(drones=2, ends=ends)
+    report = report_as_dict(flown(jnp.array([-1.0, 0.0]), env=env))
+    assert (report["episodes"], report["successes"], report["trials"]) == (3, successes, trials)
+    assert f", {successes} of {trials}{' drones' * (ends == 'drone')}, " in described_success(report)
 
 
 class YawTorque(PyTreeNode):

@@ -462,6 +462,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         ([*HOSTS, "x" * 300 + ":80"], "did not reach all others"),
         (["eval", ""], "the path is empty"),
         (["eval", "file"], "file/best.json cannot be read: Not a directory"),
+        (["eval", "raptor", "--task", "hover", "--last"], "--last is given, and raptor is no run"),
         (["eval", "nowhere", "--seed", "-1"], "seed is -1"),
         (["eval", "nowhere", "--episodes", "1000000000000"], "episodes is 1000000000000"),
         (["eval", "nowhere", "--backend", "gazebo"], "unknown backend 'gazebo'"),

@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxdrones import assets
 from jaxdrones.checks import look_up
 from jaxdrones.cli import fly
-from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.common import check_writable, folder, print_warning
 from jaxdrones.cli.live import add_live
 from jaxdrones.cli.options import add_drones, add_output, add_set, add_task, option, switch
 from jaxdrones.cli.policies import is_user_policy, open_policy
@@ -70,7 +70,7 @@ def _demo(options: argparse.Namespace) -> int:
     size = f"{output.stat().st_size / 1e6:.1f} MB"
     print_results(options, {"flights": [*exhibits], "files": [str(output)]}, f"wrote {output} ({size})")
     if not options.no_open and not webbrowser.open(output.absolute().as_uri()):
-        print("no browser was found; open the page in one")
+        print_warning("no browser was found; open the page in one")
     return 0
 
 

@@ -81,6 +81,8 @@ def open_policy(
     `options`, those of `jaxdrones.make`, are empty. `last` opens the newest policy of a run, not the best.
     """
     if is_user_policy(policy):
+        if last:
+            raise UserError(f"--last is given, and {policy} is no run, which has a newest policy; leave it out")
         if task is None:
             raise UserError(f"--task is missing; give the task for {policy}, for example --task hover")
         return UserPolicy(str(policy), task, realistic, options)

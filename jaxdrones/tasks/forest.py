@@ -36,6 +36,9 @@ camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
 
 
 _HAS_REACHED = shaping.variable("reached", f"One if the drone has been within {REACHED:g} m of its goal.")
+_ARRIVES = shaping.variable(
+    "arrives", f"One in the step in which the drone comes within {REACHED:g} m of its goal for the first time."
+)
 
 
 @checked
@@ -91,6 +94,7 @@ def forest(
             "clearance": zero + _CLEARANCE,
             "touched": false,
             "reached": false,
+            "arrives": false,
         }
 
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
@@ -158,7 +162,7 @@ def forest(
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
             "touched": (-10.0, touching.METRICS["touched"]),
-            "reached": (10.0, _HAS_REACHED),
+            "reached": (10.0, _ARRIVES),
         },
         terminations={
             "touched": shaping.flag("touched", "A drone touches the ground, a tree or another drone."),
@@ -188,11 +192,13 @@ def forest(
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
     variables, pos = world.variables, world.drones.pos
-    goal = variables["goal"]
+    goal, reached = variables["goal"], variables["reached"]
+    near = norm(pos - goal) < REACHED
     return touching.advance(task, world) | {
         "progress": norm(variables["pos"] - goal) - norm(pos - goal),
         "path": variables["path"] + norm(pos - variables["pos"]),
-        "reached": variables["reached"] | (norm(pos - goal) < REACHED),
+        "reached": reached | near,
+        "arrives": near & ~reached,
     }
 
 

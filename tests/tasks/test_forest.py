@@ -53,6 +53,16 @@ def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     assert moved_to((5.0, 0.0, 0.01))["touched"][0]  # the ground
 
 
+def test_a_goal_is_rewarded_once_also_while_a_team_waits_for_others():
+    world, rewarded = first_world(), []
+    for x in (18.9, 19.1, 19.2, 18.5, 19.5):
+        world = world.replace(drones=world.drones.replace(pos=jnp.array([[x, 0, 1.5]])))
+        world = world.replace(variables=advance(world))
+        scale, term = ENV().task.rewards["reached"]
+        rewarded.append(scale * float(term(ENV().task, world)[0]))
+    assert rewarded == [0, 10, 0, 0, 0]
+
+
 def test_the_path_is_summed_and_progress_is_what_the_goal_comes_closer():
     world = first_world()
     world = world.replace(variables=world.variables | {"start": jnp.array([[0, 0, 1.5]]), "path": jnp.zeros(1)})

@@ -24,6 +24,7 @@ from jaxdrones.flights.files import save_npz
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.training.betaflight_pilot import PolicyPilot
 
+_TARGET, _AXES = "0,0,1.5", ",".join(map(str, AXES))
 _RATE = whole("rate of the physics (Hz)", limit=8000)
 _TAKE_OFF = 4.0  # s after arming from which the distance to the target counts, and a policy flies
 
@@ -47,7 +48,7 @@ def add(commands) -> None:
     pilots = parser.add_argument_group("pilot")
     clock = parser.add_argument_group("clock")
     files = parser.add_argument_group("files and output")
-    option(pilots, "--target X,Y,Z", "position to fly to, m", default="0,0,1.5")
+    option(pilots, "--target X,Y,Z", "position to fly to, m", default=_TARGET)
     option(pilots, "--flip S", "time of a flip after arming, s", float, check=number("s", at_least=0))
     option(pilots, "--policy RUN", "fly a policy, with action=thrust_and_rates", folder)
     option(pilots, "--joystick DEVICE", "fly by hand, such as /dev/input/js0", Path)
@@ -55,7 +56,7 @@ def add(commands) -> None:
         pilots,
         "--axes R,P,T,Y",
         "axes of roll, pitch, throttle, yaw; -1 is axis 0 reversed, -2 is axis 1 reversed, ...",
-        default=",".join(map(str, AXES)),
+        default=_AXES,
     )
     option(clock, "--duration S", "simulated time after arming, s (until Ctrl-C)", float, check=number("s", above=0))
     option(clock, "--physics-hz HZ", "states per second, a multiple of 100", int, 1000, _RATE)
@@ -130,8 +131,12 @@ def _check(options: argparse.Namespace) -> None:
         raise UserError(
             f"--physics-hz is {options.physics_hz}; give a multiple of {1 / PERIOD:g}, the rate of the sticks"
         )
-    options.target = _numbers("target", options.target, 3, float)
-    options.axes = _numbers("axes", options.axes, 4, int)
+    target, axes = _numbers("target", options.target, 3, float), _numbers("axes", options.axes, 4, int)
+    if options.target != _TARGET and (options.policy or options.joystick):
+        raise UserError("--target is given beside --policy or --joystick, which flies elsewhere; leave it out")
+    if options.axes != _AXES and options.joystick is None:
+        raise UserError("--axes is given without --joystick; leave it out, or give both")
+    options.target, options.axes = target, axes
 
 
 def _numbers(name: str, text: str, count: int, kind: Callable[[str], Any]) -> tuple[Any, ...]:

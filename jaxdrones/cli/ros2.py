@@ -26,6 +26,7 @@ from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
+_CAMERA_HZ = 10.0
 _RATE = whole("control rate (Hz)", limit=20_000)
 _OF_REPLAY = ("bag", "speed", "json", "run", "ranges", "debug")
 
@@ -49,7 +50,7 @@ def add(commands) -> None:
     option(watch, "--speed X", "real-time factor", float, 1.0, check=number(above=0))
     option(watch, "--duration S", "simulated time, s (until Ctrl-C)", float, check=number("s", at_least=0))
     option(wire, "--camera WxH", "resolution of a camera on every drone, pixels (none)")
-    option(wire, "--camera-hz HZ", "images per second", float, 10.0)
+    option(wire, "--camera-hz HZ", "images per second", float, _CAMERA_HZ)
     option(watch, "--timeout S", "seconds without a command before the failsafe acts", float, 1.0)
     option(watch, "--wait S", "the same timeout before the first command", float, 30.0)
     option(watch, "--failsafe NAME", "{}", default="hover", known=ACTIONS)
@@ -115,6 +116,8 @@ def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Sim
 
 def _camera(options: argparse.Namespace) -> Camera | None:
     if options.camera is None:
+        if options.camera_hz != _CAMERA_HZ:
+            raise UserError(f"--camera-hz {options.camera_hz:g} is given without --camera; give both or none")
         return None
     return Camera(resolution=parse_pixels("--camera", options.camera, "64x48"), rate=options.camera_hz)
 

@@ -1,6 +1,7 @@
 """`jaxdrones view`."""
 
 import argparse
+import functools
 import sys
 import webbrowser
 import zipfile
@@ -46,10 +47,13 @@ def add(commands) -> None:
     option(filmed, "--camera NAME", "{}", default="orbit", check=choice("camera", films.CAMERAS), known=films.CAMERAS)
     option(filmed, "--size WxH", "size, pixels", default="1280x720")
     option(filmed, "--fps N", "frames per second", int, 24, check=whole())
-    parser.set_defaults(run=_view)
+    parser.set_defaults(run=functools.partial(_view, parser))
 
 
-def _view(options: argparse.Namespace) -> int:
+def _view(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    for name in ("camera", "size", "fps") if options.video is None else ():
+        if getattr(options, name) != parser.get_default(name):
+            raise UserError(f"--{name} {getattr(options, name)} is given without --video FILE; give both or none")
     options.size = parse_pixels("--size", options.size, "1280x720")
     if any(pixels % 2 for pixels in options.size):
         raise UserError(f"--size is {options.size}; give two even numbers of pixels, for example 1280x720")

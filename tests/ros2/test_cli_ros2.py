@@ -53,6 +53,7 @@ def test_a_landing_is_reported_as_json(wire, capsys):
         (["--failsafe", "pray"], "unknown failsafe 'pray'"),
         (["--timeout", "0"], "timeout is 0.0"),
         (["--camera", "big"], "--camera is 'big'; give width and height"),
+        (["--camera-hz", "5"], "--camera-hz 5 is given without --camera; give both or none"),
         (["--control-hz", "0"], "control rate (Hz) is 0"),
         (["--duration", "-1"], "duration is -1.0"),
         (["--speed", "0"], "speed is 0.0"),

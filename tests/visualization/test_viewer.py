@@ -273,6 +273,12 @@ def test_pixels_of_depth_are_of_its_share_of_the_farthest_up_to_ten_meters(team)
     assert images["frames"][0, 0, ..., 0].tolist() == [[255, 191], [128, 0]] and images["farthest"] == 10
 
 
+@pytest.mark.parametrize("option", [("--camera", "follow"), ("--size", "64x48"), ("--fps", "10")])
+def test_an_option_of_a_film_is_refused_without_one(option, capsys):
+    assert main(["view", "nowhere", *option]) == 2
+    assert f"{' '.join(option)} is given without --video FILE; give both or none" in capsys.readouterr().err
+
+
 def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(record, tmp_path, capsys):
     """As `runs/compare/*` holds a figure beside the logs; but not one that is not there, a damaged log, or all."""
     for name in "one", "other":

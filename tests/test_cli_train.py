@@ -373,6 +373,23 @@ def test_a_file_of_options_is_read_however_it_is_given(tmp_path):
         assert configured("train", "hover", *words) == read
 
 
+@pytest.mark.parametrize(
+    ("given", "sweep", "settings"),
+    [
+        (["--sweep", "horizon=2,3"], ["horizon=2,3"], {"gamma": 0.5}),  # also in place of a value of [sweep]
+        (["--sweep=gamma=0.1,0.2"], ["horizon=5,6", "gamma=0.1,0.2"], {}),
+        (["--set", "horizon=7"], [], {"gamma": 0.5, "horizon": 7}),
+        (["--set=gamma=0.3"], ["horizon=5,6"], {"gamma": 0.3}),
+    ],
+)
+def test_settings_of_the_command_line_override_those_of_a_file(given, sweep, settings, tmp_path):
+    (tmp_path / "options.toml").write_text("[set]\ngamma = 0.5\n[sweep]\nhorizon = [5, 6]\n")
+    words = with_config(["train", "hover", "--config", str(tmp_path / "options.toml"), *given])
+    request = Request.of(_parser().parse_args(words))
+    assert request.sweep == sweep and request.settings == settings
+    assert request.swept()
+
+
 def test_a_task_of_the_command_line_overrides_that_of_a_file(tmp_path):
     file = tmp_path / "options.toml"
     file.write_text('task = "hover"\nseeds = 2\n')

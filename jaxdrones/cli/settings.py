@@ -75,9 +75,10 @@ def with_config(arguments: list[str], train: argparse.ArgumentParser) -> list[st
     _check_entries(file, entries, train)
     if any(_is_positional(words) for words in itertools.pairwise(rest[command:])):
         task = []
-    options = []
+    options, overridden = [], _settings_in(rest)
     for name, x in entries.items():
         if isinstance(x, dict):  # set and sweep
+            x = {key: value for key, value in x.items() if key not in overridden}
             lists = {key: value if isinstance(value, list) else [value] for key, value in x.items()}
             values = {key: ",".join(map(str, value)) for key, value in lists.items()} if name == "sweep" else x
             options += [f"--{name}={key}={value}" for key, value in values.items()]
@@ -94,6 +95,14 @@ def _check_entries(file: Path, entries: dict[str, Any], train: argparse.Argument
         check_choice(f"option in --config {file}:", name, options.keys() - {"help", "config"})
         if x is True and options[name].nargs is None:
             raise UserError(f"--config {file}: {name} is true; give its value")
+
+
+def _settings_in(arguments: list[str]) -> set[str]:
+    """Names of the settings of --set and --sweep."""
+    words = [
+        x for word in arguments for x in (word.split("=", 1) if word.startswith(("--set=", "--sweep=")) else [word])
+    ]
+    return {word.partition("=")[0] for option, word in itertools.pairwise(words) if option in ("--set", "--sweep")}
 
 
 def _is_positional(words: tuple[str, str]) -> bool:

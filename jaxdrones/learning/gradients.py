@@ -55,8 +55,8 @@ class GradientConfig(Config):
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
     outlier_gradient: PositiveOrInfinite = _UNLIMITED
-    """Largest gradient of a world at a control step, relative to the median of the worlds with a gradient. Longer ones
-    are scaled down, so that a few chaotic worlds do not dominate."""
+    """Largest gradient of a world at a control step, relative to the median of the worlds of its device with a
+    gradient. Longer ones are scaled down, so that a few chaotic worlds do not dominate."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Switch = True
@@ -106,7 +106,7 @@ def _(arguments: tuple[Array, Scalar], changes: tuple[Array, Scalar]) -> tuple[A
 
 @jax.custom_vjp
 def limit_gradient(worlds: Any, limit: Scalar) -> Any:
-    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds.
+    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds of the device.
 
     Worlds whose gradient is zero, as after an episode, or not finite do not count.
     """

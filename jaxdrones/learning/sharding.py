@@ -1,9 +1,10 @@
 """Training on several devices of one or more hosts: each device simulates its share of the worlds.
 
 A training state is replicated on all devices except for its `worlds`, which are sharded. The random numbers of a world
-are independent of its device, so the result equals that of one device up to rounding. Devices exchange gradients and
-statistics, but nothing during the collection of trajectories, which is a `shard_map` (`map_worlds`). To use several
-devices without `jaxdrones.training`:
+are independent of its device, so the result equals that of one device up to rounding, except with `outlier_gradient`,
+which compares a gradient with those of the worlds of its device. Devices exchange gradients and statistics, but nothing
+during the collection of trajectories, which is a `shard_map` (`map_worlds`). To use several devices without
+`jaxdrones.training`:
 
     with jax.set_mesh(sharding.make_mesh(config.worlds)):
         result = jax.jit(lambda key: bptt.train(key, env, config))(key)

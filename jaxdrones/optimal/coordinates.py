@@ -103,24 +103,24 @@ def tracking_error(params: Params, state: State, reference: State) -> Float[Arra
 def feedback_error(params: Params, state: State, reference: State) -> Float[Array, " d"]:
     """`tracking_error` for large errors of the heading, the same to first order.
 
-    A drone accelerates along its own heading. Positions and velocities are therefore along the heading of the drone,
-    and the attitude is a turn about the z axis of the reference (third component) and then a tilt about the x and y
-    axes of the body, each as twice the vector part of its quaternion.
+    A drone accelerates along its own heading. Up to a tilt of 90 degrees from the reference, positions and velocities
+    are therefore along the heading of the drone, and the attitude is a turn about the z axis of the reference (third
+    component) and then a tilt about the x and y axes of the body, each as twice the vector part of its quaternion.
+    Beyond, where a heading means little, it is the `tracking_error`.
     """
     parts = _parts(params, state, reference)
     error = rotation.multiply(rotation.conjugate(reference.quat), state.quat)
     error = jnp.where(error[3] < 0, -error, error)
-    square = error[2] ** 2 + error[3] ** 2
-    defined = square > jnp.finfo(error.dtype).eps  # not upside down with respect to the reference
-    length = jnp.sqrt(jnp.where(defined, square, 1))
-    sin, cos = jnp.where(defined, error[2] / length, 0), jnp.where(defined, error[3] / length, 1)  # of half the turn
+    square = error[2] ** 2 + error[3] ** 2  # squared cosine of half the tilt
+    upright = square > 0.5
+    length = jnp.sqrt(jnp.where(upright, square, 1))
+    sin, cos = jnp.where(upright, error[2] / length, 0), jnp.where(upright, error[3] / length, 1)  # of half the turn
     zero = jnp.zeros_like(sin)
-    tilt = rotation.multiply(jnp.stack([zero, zero, -sin, cos]), error)
-    about_x, about_y = jnp.where(tilt[3] < 0, -2, 2) * tilt[:2]
+    x, y, _, _ = rotation.multiply(jnp.stack([zero, zero, -sin, cos]), error)
+    turn = jnp.where(upright, 2 * jnp.stack([x, y, sin]), parts[1])
     c, s = _heading(reference.quat)
     cos_turn, sin_turn = cos * cos - sin * sin, 2 * sin * cos
-    heading = c * cos_turn - s * sin_turn, s * cos_turn + c * sin_turn
-    return _along(heading, parts, jnp.stack([about_x, about_y, 2 * sin]))
+    return _along((c * cos_turn - s * sin_turn, s * cos_turn + c * sin_turn), parts, turn)
 
 
 def _heading(quat: Float[Array, "4"]) -> tuple[Array, Array]:

@@ -150,6 +150,24 @@ def test_position_and_tilt_enter_the_feedback_alike_whatever_the_heading_of_the_
         np.testing.assert_allclose(z[5], 2 * np.sin((angle + np.pi) % (2 * np.pi) / 2 - np.pi / 2), atol=1e-12)
 
 
+def test_beyond_a_tilt_of_90_degrees_the_feedback_has_the_tracking_error():
+    """A heading means little there: with its own a tumbling drone recovers less often."""
+    params, state = some_state()
+    reference = hover(params, state)
+
+    @jit_unoptimized
+    def errors(degrees):
+        tilt, turn = (
+            jd.rotation.exp(jnp.radians(v)) for v in (degrees * jnp.array([0.6, 0.8, 0]), jnp.array([0, 0, 100.0]))
+        )
+        there = state.replace(quat=jd.rotation.multiply(turn, tilt))
+        return feedback_error(params, there, reference), tracking_error(params, there, reference)
+
+    for degrees, same in (89.0, False), (91.0, True), (179.0, True), (181.0, True):
+        found, expected = errors(degrees)
+        assert np.allclose(found, expected, rtol=0, atol=1e-12) == same
+
+
 @pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("rotors", [jd.instant_rotors, jd.lagging_rotors])

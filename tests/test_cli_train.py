@@ -384,8 +384,8 @@ def test_a_file_of_options_is_read_however_it_is_given(tmp_path):
 )
 def test_settings_of_the_command_line_override_those_of_a_file(given, sweep, settings, tmp_path):
     (tmp_path / "options.toml").write_text("[set]\ngamma = 0.5\n[sweep]\nhorizon = [5, 6]\n")
-    words = with_config(["train", "hover", "--config", str(tmp_path / "options.toml"), *given])
-    request = Request.of(_parser().parse_args(words))
+    words = configured("train", "hover", "--config", str(tmp_path / "options.toml"), *given)
+    request = Request.of(make_parser().parse_args(words))
     assert request.sweep == sweep and request.settings == settings
     assert request.swept()
 

@@ -152,7 +152,7 @@ def test_a_user_policy_of_a_wrong_shape_is_refused(here, capsys):
 def test_an_evaluation_that_is_not_finite_fails(here, capsys, monkeypatch):
     nan = float("nan")
     errors, metrics = dict.fromkeys((50, 95, 99), nan), {"error": nan, "speed": nan}
-    report = Report(2, 2, 0.0, (0.0, 0.66), nan, errors, nan, nan, 0.01, {"lost": 1.0}, metrics)
+    report = Report(2, 2, 2, 0.0, (0.0, 0.66), nan, errors, nan, nan, 0.01, {"lost": 1.0}, metrics)
     monkeypatch.setattr("jaxdrones.cli.evaluate.evaluate", lambda *_: report)
     Path("my_policy.py").write_text("def policy(obs):\n    return obs[:, :4] * float('nan')\n")
     assert main(["eval", "my_policy.py:policy", "--task", "hover"]) == 1

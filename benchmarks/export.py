@@ -99,12 +99,11 @@ def flown(env: Env, policy: Policy) -> dict[str, np.ndarray]:
         return jax.lax.scan(control_step, carry, jnp.stack(keys))[1]
 
     obs = jax.jit(jax.vmap(flight))(jax.random.split(jax.random.key(2), _DRONES // env.drones))
-    named = (
-        {"obs" if name == "state" else name: x for name, x in obs.items()} if isinstance(obs, dict) else {"obs": obs}
-    )
+    images = dict(obs) if isinstance(obs, dict) else {"state": obs}
+    named = {"obs": images.pop("state")} | images  # in the order of the arguments
     return {
-        name: np.ascontiguousarray(np.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:]))
-        for name, x in jax.device_get(named).items()
+        name: np.ascontiguousarray(np.moveaxis(np.asarray(x), 0, 1).reshape(x.shape[1], -1, *x.shape[3:]))
+        for name, x in named.items()
     }
 
 

@@ -206,8 +206,8 @@ def update(rows: Sequence[Row]) -> None:
 
 def write(rows: Sequence[Row], file: Path, page: Path, figure: Path) -> None:
     """Write results, the table of the page, and the figure."""
-    commits = dict.fromkeys(row["about"]["commit"] for row in rows)
-    result = {"rows": list(rows), "about": rows[-1]["about"] | {"commit": ", ".join(commits)}, "lines": lines(rows)}
+    each = {key: ", ".join(dict.fromkeys(row["about"][key] for row in rows)) for key in ("commit", "cpu")}
+    result = {"rows": list(rows), "about": rows[-1]["about"] | each, "lines": lines(rows)}
     file.write_text(json.dumps(result, indent=1) + "\n")
     if page.is_file():
         page.write_text(tables.rewritten(page.read_text(), {"leaderboard": result}))

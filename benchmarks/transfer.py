@@ -18,7 +18,7 @@ import dataclasses
 import importlib.metadata
 import importlib.util
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -28,6 +28,7 @@ import jaxdrones as jd
 from benchmarks.common import outcome, success_rate
 from benchmarks.rivals import environment
 from jaxdrones.checks import check_choice
+from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.evaluation import wilson_interval
@@ -131,7 +132,7 @@ def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     for airframe in options.airframes or crazyflow.AIRFRAMES:
         sim = crazyflow.make_sim(airframe)
         env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), randomize=())
-        env = with_physics(env, crazyflow.make_step(sim, substeps=round(env.dt * sim.freq)))
+        env = with_physics(env, Elsewhere(env.physics, crazyflow.make_step(sim, substeps=round(env.dt * sim.freq))))
         rows += [flown(f"crazyflow {airframe}", run, env, options.episodes) for run in runs]
     return rows
 
@@ -159,7 +160,22 @@ def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
     return {"plant": plant, "policy": run.folder.name, "episodes": n} | found
 
 
-def with_physics(env: Env, step) -> Env:
+class Elsewhere(Step):
+    """Step of another simulator in an environment without sensors, which would need its derivative."""
+
+    def __init__(self, own: Step, step: Callable[[jd.Params, jd.State, jax.Array], jd.State]):
+        self.physics, self._step = own.physics, step
+
+    def __call__(self, params, state, rpm, scene=None):
+        """Advance a team by one control step; the other simulator has its own parameters and no scene."""
+        return self._step(params, state, rpm).replace(aux=state.aux)
+
+    def rate(self, params, state, rpm, scene=None):
+        """Unknown."""
+        raise NotImplementedError("the derivative is inside of the other simulator")
+
+
+def with_physics(env: Env, step: Step) -> Env:
     """The same environment on another plant."""
     return dataclasses.replace(env, physics=step)
 

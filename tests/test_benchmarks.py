@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
-from benchmarks import accelerator, lap, published
+from benchmarks import accelerator, lap, published, transfer
 from benchmarks.__main__ import NAMES
 from benchmarks.common import success_rate
 from jaxdrones.visualization.browser import find_browser
@@ -254,6 +254,18 @@ def test_a_plant_stands_beside_the_figures_of_its_integrator_and_number_of_world
 def test_a_success_rate_is_reported_with_its_interval_if_there_is_one():
     assert success_rate(0.5, (0.25, 0.75)) == "0.5000 [0.2500, 0.7500]"
     assert success_rate(1.0, None) == "1.0000 [1 distinct episode]" and success_rate(None, None) == "no criterion"
+
+
+@pytest.mark.slow
+def test_an_environment_with_the_step_of_elsewhere_flies_that_plant():
+    env = jd.make("hover", realistic=True, drones=2)
+    there = transfer.with_physics(env, transfer.Elsewhere(env.physics, lambda *now: env.physics(*now)))
+    key, action = jax.random.key(0), jnp.full((2, 4), 0.1)
+    flights = [jax.jit(lambda env=env: env.step(key, env.reset(key)[1], action))() for env in (env, there)]
+    jax.tree.map(np.testing.assert_array_equal, *flights)
+    still = transfer.with_physics(env, transfer.Elsewhere(env.physics, lambda params, state, rpm: state))
+    _, world = env.reset(key)
+    np.testing.assert_array_equal(still.step(key, world, action)[1].drones.pos, world.drones.pos)
 
 
 @pytest.mark.slow

@@ -84,8 +84,9 @@ def agreement(seconds: float = 0.5, freq: int = 500) -> dict[str, float]:
             rpm=team.hover_rpm[:, None] * jnp.ones(4),
         )
         command = team.hover_rpm[:, None] * jnp.array([1.02, 1.03, 1.05, 0.97])
-        ended = [vars(step(team, start, command)) for step in (theirs, ours)]
-        return {name: float(np.max(np.abs(ended[0][name] - ended[1][name]))) for name in ended[0]}
+        ended = [step(team, start, command) for step in (theirs, ours)]
+        names = ("pos", "quat", "vel", "omega", "rpm")
+        return {name: float(np.max(np.abs(getattr(ended[0], name) - getattr(ended[1], name)))) for name in names}
 
 
 def told(theirs, params: jd.Params):

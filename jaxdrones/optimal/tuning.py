@@ -204,7 +204,7 @@ def _errors_of_flights(
 ) -> Float[Array, "sets flights"]:
     """Errors of the test flights of sets of gains, with a first axis of sets and a second of `_FLIGHTS`.
 
-    The flights are simulated as those of one team without interaction: a team under `vmap` takes much longer to compile.
+    The flights are simulated as those of one team without interaction: a team under `vmap` takes longer to compile.
     """
 
     def lagging(times: float) -> Params:

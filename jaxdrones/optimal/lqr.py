@@ -5,20 +5,25 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
-from jaxdrones.optimal.coordinates import command_unit, feedback_error, linearize_step, single
+from jaxdrones.optimal.coordinates import command_unit, feedback_error, linearize_step, of_point_masses, single
 from jaxdrones.optimal.problem import Weights, checked_step, checked_weights, hover, posed
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.status import OnFailure, Status, is_finite, raise_unless_ok, status_of
+from jaxdrones.vector import safe_sqrt
 
 _DOUBLINGS = 20  # a million control steps
+_TILT = 0.6  # largest tilt that errors of position and velocity ask for, rad
+_LIFT = 0.3  # largest change of the rotor speeds that they ask for, over that of hover
+_TURNS = np.r_[3:6, 9:16]  # attitude, angular velocity and rotor speeds in a difference
 
 
 class Settings(PyTreeNode):
@@ -83,8 +88,43 @@ def control(
 def feedback(
     params: Params, gain: Float[Array, "4 d"], state: State, target: State, rpm: Float[Array, "4"]
 ) -> Float[Array, "4"]:
-    """Command of a reference with feedback of the tracking error, limited, RPM."""
-    return limited(params, rpm - command_unit(params) * (gain @ feedback_error(params, state, target)))
+    """Command of a reference with feedback of the tracking error, limited, RPM.
+
+    The gain holds near the reference. From afar, the drone approaches at a speed that it can brake, and errors of
+    position and velocity ask for at most `_TILT` and `_LIFT`, which leaves the attitude its share of the rotor speeds.
+    """
+    error = feedback_error(params, state, _on_the_way(params, gain, state, target))
+    translation = gain @ error.at[_TURNS].set(0)
+    collective = jnp.mean(translation)
+    lateral = translation - collective
+    lift = _LIFT * (1 + jnp.sum(gain[:, 12:16]) / 4)  # rotors with a lag also feed their speeds back
+    most = _TILT * _length(gain[:, 3])
+    lateral = lateral * most / jnp.maximum(jnp.maximum(most, _length(lateral)), jnp.finfo(most.dtype).tiny)
+    rotation = gain[:, _TURNS] @ error[_TURNS]
+    return limited(params, rpm - command_unit(params) * (rotation + lateral + jnp.clip(collective, -lift, lift)))
+
+
+def _on_the_way(params: Params, gain: Float[Array, "4 d"], state: State, target: State) -> State:
+    """Reference whose position is moved towards a drone that is far away.
+
+    The gain asks for a speed that is proportional to the distance. It is limited to one from which half of the
+    acceleration of `_TILT` or `_LIFT` stops the drone at the target (ArduPilot's square-root controller).
+    """
+    away = state.pos - target.pos
+
+    def near(axes: slice, acc: Array) -> Array:
+        slowed = jnp.maximum(_length(gain[:, 6:9][:, axes]), jnp.finfo(gain.dtype).tiny)
+        rate = _length(gain[:, axes]) / slowed  # speed over distance, 1/s
+        x = acc / jnp.maximum(acc, rate**2 * _length(away[axes]))
+        return away[axes] * (1 - jnp.sqrt(x * (2 - x)))
+
+    shift = jnp.concatenate([near(slice(2), _TILT * params.gravity / 2), near(slice(2, 3), _LIFT * params.gravity)])
+    aux = of_point_masses(lambda load: load.replace(pos=load.pos + shift), target.aux)
+    return target.replace(pos=target.pos + shift, aux=aux)
+
+
+def _length(x: Array) -> Float[Array, ""]:
+    return safe_sqrt(jnp.sum(x**2))
 
 
 def gain(

@@ -1,5 +1,7 @@
 """The Riccati equation, the linearizations and the regulator."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -168,18 +170,58 @@ def test_beyond_a_tilt_of_90_degrees_the_feedback_has_the_tracking_error():
         assert np.allclose(found, expected, rtol=0, atol=1e-12) == same
 
 
+def test_the_feedback_is_linear_near_the_reference():
+    params, state = some_state()
+    settings = lqr.settings(make_step(dt=DT))
+    reference = hover(params, state)
+
+    @jit_unoptimized
+    def commands(z):
+        gain, there = lqr.init(settings, params, state).gain, displaced(params, reference, z)
+        linear = reference.rpm - params.hover_rpm * (gain @ feedback_error(params, there, reference))
+        return lqr.feedback(params, gain, there, reference, reference.rpm), linear
+
+    found, linear = commands(0.02 * jnp.asarray(np.random.default_rng(3).uniform(-1, 1, 16)))
+    np.testing.assert_allclose(found, linear, rtol=1e-12)
+
+
+def test_from_afar_a_drone_approaches_at_the_speed_from_which_it_stops_at_the_target():
+    """At sqrt(2 a s) with s the distance, less what the linear feedback near the target adds to it."""
+    params, state = some_state()
+    settings = lqr.settings(make_step(dt=DT))
+    reference = hover(params, state)
+
+    @functools.partial(jit_unoptimized, static_argnums=3)
+    def command(pos, direction, limit, axes):
+        axes = slice(*axes)
+        gain = lqr.init(settings, params, state).gain
+        rate = jnp.linalg.norm(gain[:, axes]) / jnp.linalg.norm(gain[:, 6:9][:, axes])
+        speed = jnp.sqrt(2 * limit * jnp.linalg.norm(pos) - (limit / rate) ** 2)
+        there = reference.replace(pos=pos, vel=-speed * direction)
+        return lqr.feedback(params, gain, there, reference, reference.rpm)
+
+    level, upright = jnp.array([0.6, -0.8, 0.0]), jnp.array([0.0, 0.0, 1.0])
+    for distance in (5.0, 50.0):
+        for direction, limit, axes in ((level, 0.6 / 2, (0, 2)), (-upright, 0.3, (2, 3))):
+            found = command(distance * direction, direction, limit * float(params.gravity), axes)
+            np.testing.assert_allclose(found, reference.rpm, rtol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("rotors", [jd.instant_rotors, jd.lagging_rotors])
-def test_the_regulator_recovers_from_a_large_error_of_the_heading(rotors):
+def test_the_regulator_recovers_from_large_errors(rotors):
+    """Of the heading, the position and the velocity, and of all of them."""
     team = team_of("cf2x")
     params, step = one(team), make_step(rotors=rotors, dt=1 / 400, substeps=4)
     settings = lqr.settings(step)
 
     @jax.jit
-    def end(degrees):
+    @jax.vmap
+    def end(start):
+        pos, degrees, speed = start[:3], start[3], start[4:]
         attitude = jd.rotation.exp(jnp.array([0.0, 0.0, 1.0]) * jnp.radians(degrees))
-        start = one(hovering(team)).replace(pos=jnp.array([0.3, 0.0, 0.0]), quat=attitude)
+        start = one(hovering(team)).replace(pos=pos, quat=attitude, vel=speed)
 
         def advance(carry, _):
             memory, state = carry
@@ -187,10 +229,13 @@ def test_the_regulator_recovers_from_a_large_error_of_the_heading(rotors):
             return (memory, one(step(team, jax.tree.map(lambda x: x[None], state), rpm[None]))), None
 
         start = start.replace(rpm=jnp.broadcast_to(params.hover_rpm, (4,)))
-        (_, state), _ = jax.lax.scan(advance, (lqr.init(settings, params, start), start), length=500)
+        (_, state), _ = jax.lax.scan(advance, (lqr.init(settings, params, start), start), length=2000)
         return jnp.linalg.norm(state.pos)
 
-    assert np.all(jax.vmap(end)(jnp.array([0.0, 90.0, 130.0, 150.0, 179.0, -130.0])) < 0.01)
+    turned = [(0.3, 0, 0, degrees, 0, 0, 0) for degrees in (0, 90, 130, 150, 179, -130)]
+    away = [(x, y, z, 0, 0, 0, 0) for x, y, z in ((1, 0, 0), (0, -5, 0), (0, 0, 20), (0, 0, -20), (30, -30, 20))]
+    fast = [(0, 0, 0, 0, 8, 0, 0), (0, 0, 0, 0, 0, -5, 5), (-3, 4, 2, 120, 4, 4, -4)]
+    assert np.all(end(jnp.array([*turned, *away, *fast], float)) < 0.01)
 
 
 @pytest.mark.float32

@@ -3,9 +3,9 @@
 Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium with software rendering, in a
 window of 1,100 x 720 pixels. In `simulated` flights the page computes the physics at 500 Hz and the policy of hover at
 100 Hz. The page lowers the resolution of the view while frames take longer than 1/32 s; the resolution is reported
-along each side. `CPU ms` is the CPU time of all processes of the browser for a frame at half of the resolution along
-each side; it hardly depends on other programs. The size of the page and the times to make and to load it are also
-measured.
+along each side. `at half` are the frames per second at half of the resolution along each side, whatever a frame takes,
+and `CPU ms` is the CPU time of all processes of the browser for such a frame; it hardly depends on other programs. The
+size of the page and the times to make and to load it are also measured.
 """
 
 import argparse
@@ -17,11 +17,18 @@ from pathlib import Path
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.visualization.browser import find_browser, open_tab
+from jaxdrones.visualization.browser import Tab, find_browser, open_tab
 from jaxdrones.visualization.viewer import Page
 
 DT = 0.01  # s
 FRAMES = 60  # of which the processor time is taken
+PLAY_AT_HALF = """(() => {
+    const { player } = jaxdrones, { stage } = player;
+    stage.adapt = () => stage.setSharp(false);
+    stage.share = 0.5;
+    stage.resize();
+    Object.assign(player, { again: true, playing: true });
+})()"""
 DRAW = """(() => {
     const { player } = jaxdrones, { stage } = player, gl = stage.renderer.getContext();
     player.playing = false;
@@ -79,6 +86,14 @@ def processor_seconds() -> float:
     return sum(seconds[process] for process in seconds if is_ours(process)) / os.sysconf("SC_CLK_TCK")
 
 
+def frame_rate(tab: Tab, seconds: float) -> float:
+    """Frames per second that a page draws in some seconds."""
+    begun, first = time.perf_counter(), tab.run("jaxdrones.player.frames")
+    time.sleep(seconds)
+    last, ended = tab.run("jaxdrones.player.frames"), time.perf_counter()
+    return (last - first) / (ended - begun)
+
+
 def measure(page: Page, seconds: float) -> dict:
     """Frames per second, and what belongs to them: half of the time lets the page settle, a third is counted."""
     with tempfile.TemporaryDirectory() as folder, open_tab() as tab:
@@ -88,17 +103,19 @@ def measure(page: Page, seconds: float) -> dict:
         loaded = time.perf_counter() - start
         tab.run("jaxdrones.player.playing || jaxdrones.player.toggle()")
         time.sleep(seconds / 2)
-        begun, first = time.perf_counter(), tab.run("jaxdrones.player.frames")
-        time.sleep(seconds / 3)
-        last, ended = tab.run("jaxdrones.player.frames"), time.perf_counter()
+        played = frame_rate(tab, seconds / 3)
         share = tab.run("jaxdrones.player.stage.share")
+        tab.run(PLAY_AT_HALF)
+        time.sleep(seconds / 10)
+        at_half = frame_rate(tab, seconds / 3)
         tab.run(DRAW.replace("COUNT", "5"))
         before = processor_seconds()
         tab.run(DRAW.replace("COUNT", str(FRAMES)))
         spent = processor_seconds() - before
         return {
-            "frames/s": (last - first) / (ended - begun),
+            "frames/s": played,
             "share": share,
+            "at half (frames/s)": at_half,
             "CPU ms": 1000 * spent / FRAMES,
             "MB": file.stat().st_size / 1e6,
             "loaded (s)": loaded,
@@ -115,9 +132,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def line(row: dict) -> str:
     """One row of the table."""
-    drawn = f"{row['frames/s']:8.1f}  {100 * row['share']:8.0f} %  {row['CPU ms']:7.1f}"
+    drawn = f"{row['frames/s']:8.1f}  {100 * row['share']:8.0f} %"
+    half = f"{row['at half (frames/s)']:7.1f}  {row['CPU ms']:7.1f}"
     cost = f"{row['MB']:7.2f}  {row['made (s)']:6.2g}  {row['loaded (s)']:8.2g}"
-    return f"{row['flight']:9}  {row['drones']:6,}  {drawn}  {cost}"
+    return f"{row['flight']:9}  {row['drones']:6,}  {drawn}  {half}  {cost}"
 
 
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
@@ -131,7 +149,7 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     for kind, count, make in cases:
         page, made = make()
         rows.append({"flight": kind, "drones": count} | measure(page, options.rows * DT) | {"made (s)": made})
-    lines = ["flight     drones  frames/s  resolution   CPU ms  page MB  made s  loaded s"]
+    lines = ["flight     drones  frames/s  resolution  at half   CPU ms  page MB  made s  loaded s"]
     lines += [line(row) for row in rows]
     facts = {"cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
     lines.append(f"load {facts['load']:.1f}")

@@ -139,7 +139,7 @@ def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
         first = _FIRST_SEED.get(task, 0)
         episodes = (fly_episode(env, policy, jax.random.key(seed)) for seed in range(first, first + 5))
         episode = next(episode for episode in episodes if episode.success is not False)
-        about = f"{env.task.summary[0].upper()}{env.task.summary[1:]}. {_success(task)}"
+        about = f"{env.task.summary[0].upper()}{env.task.summary[1:]}. {_success(task, env.task.ends)}"
     (record,) = records_of(episode, dict.fromkeys(("params", "dt", "targets", "labels", "images")))
     record = _thinned(record)
     payload = encode([record], [task], task, layout="alone", play=True, **_SHOWN.get(task, {}))
@@ -147,14 +147,15 @@ def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
     return Exhibit(task, about, f"jaxdrones fly --policy {task}{team} --live", payload)
 
 
-def _success(task: str) -> str:
+def _success(task: str, ends: str) -> str:
     evaluation = Run(assets.policies()[task]).report()["evaluation"]
     if evaluation["success"] is None:
         return ""
     if evaluation["distinct_episodes"] == 1:
         return f"The policy {'succeeds' if evaluation['success'] else 'fails'} from the only start of this task."
-    share = f"{100 * evaluation['success']:.1f} % of {evaluation['episodes']:,} episodes"
-    return f"The policy succeeds in {share}, each with another start."
+    whose = "for {} of the drones in" if ends == "drone" else "in {} of"
+    share = whose.format(f"{100 * evaluation['success']:.1f} %")
+    return f"The policy succeeds {share} {evaluation['episodes']:,} episodes, each with another start."
 
 
 def _thinned(record: FlightLog, rate: float = 25.0) -> FlightLog:

@@ -14,7 +14,13 @@ from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler, one_world
 from jaxdrones.accelerate.chunks import kernel_of_chunks
-from jaxdrones.accelerate.fitting import NoKernelError, can_be_a_kernel, fits_number_by_number, has_reverse_rule
+from jaxdrones.accelerate.fitting import (
+    NoKernelError,
+    can_be_a_kernel,
+    fits_number_by_number,
+    has_reverse_rule,
+    is_small,
+)
 from jaxdrones.accelerate.soa import over_last_axis
 
 P = ParamSpec("P")
@@ -24,7 +30,8 @@ R = TypeVar("R")
 def apart_under_vmap(function: Callable[P, R]) -> Callable[P, R]:
     """Compute a function of one world number by number under `jax.vmap`, and so its derivatives.
 
-    In reverse mode it is recomputed. It is unchanged if its arrays are too large or one of its primitives forbids it.
+    In reverse mode it is recomputed. It is unchanged if its arrays are too large or too many, or if a primitive forbids
+    it.
     """
 
     def called(*arguments: P.args, **named: P.kwargs) -> R:
@@ -47,7 +54,7 @@ def _called(function: Callable, tree: Any, leaves: Sequence) -> Any:
 
 
 def _fits(program: Any) -> bool:
-    return can_be_a_kernel(program) and fits_number_by_number(program)
+    return can_be_a_kernel(program) and fits_number_by_number(program) and is_small(program)
 
 
 def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: int | None) -> list[Array]:

@@ -14,6 +14,10 @@ Arrays of four drones fill the vectors of a CPU without a split."""
 _MAX_NUMBERS = 8_000
 """Largest number of entries in the loops of a program to split: they compile in about 15 s."""
 
+_MAX_APART = 12_000
+"""Largest number of entries of a program to split wherever they are, such as the derivative of a step of eight drones
+without interaction; with interaction such programs of four drones compile for minutes."""
+
 _MAX_AT_ONCE = 3_700
 """Largest number of entries of several iterations of a loop in one kernel of an accelerator: they compile in about 5 s.
 Starting a kernel takes as long as some 40 iterations of the physics within it."""
@@ -92,12 +96,21 @@ def fits_number_by_number(program: Any) -> bool:
     return max(sizes, default=0) <= LARGEST and sum(sizes) <= _MAX_NUMBERS
 
 
+def is_small(program: Any) -> bool:
+    """Whether a program as a whole has few enough entries to split."""
+    return _numbers(program) <= _MAX_APART
+
+
+def _numbers(program: Any) -> int:
+    """Entries of all the arrays that a program computes."""
+    return sum(v.aval.size for eqn in _equations(program) if not any(compiler.held(eqn)) for v in eqn.outvars)
+
+
 def iterations_at_once(program: Any, length: int) -> int:
     """Number of iterations of a loop in one kernel of an accelerator, a divisor of `length`; one with inner loops."""
     if _has_loop(program):
         return 1
-    numbers = sum(v.aval.size for eqn in _equations(program) if not any(compiler.held(eqn)) for v in eqn.outvars)
-    most = max(1, min(length, _MAX_AT_ONCE // max(numbers, 1)))
+    most = max(1, min(length, _MAX_AT_ONCE // max(_numbers(program), 1)))
     return next(count for count in range(most, 0, -1) if length % count == 0)
 
 

@@ -107,12 +107,18 @@ def test_what_it_closes_over_may_be_traced():
     np.testing.assert_allclose(slope, jnp.sum(X**3), rtol=1e-12)
 
 
-@pytest.mark.parametrize("size", [3, 50], ids=["sorting", "large arrays"])
-def test_what_cannot_be_apart_is_as_vmap_computes_it(size):
+@pytest.mark.parametrize(
+    ("size", "length", "each"),
+    [(3, 3, jnp.sort), (50, 3, jnp.negative), (36, 400, jnp.negative)],
+    ids=["sorting", "large arrays", "many arrays, which would compile for long"],
+)
+def test_what_cannot_be_apart_is_as_vmap_computes_it(size, length, each):
     x = jnp.asarray(rng.normal(size=(4, size)))
 
     def function(x):
-        return jax.lax.scan(lambda x, _: (jnp.sort(x) if size == 3 else 0.9 * x, None), x, length=3)[0]
+        if length > 3:
+            return functools.reduce(lambda x, _: each(x), range(length), x)
+        return jax.lax.scan(lambda x, _: (each(x), None), x, length=length)[0]
 
     ours = jax.jit(jax.vmap(apart_under_vmap(function)))
     assert "small_call" not in ours.lower(x).as_text()

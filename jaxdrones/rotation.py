@@ -9,16 +9,25 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.errors import UserError
 from jaxdrones.vector import atan2, components, dot, sin_cos
 
 _SMALL = 1e-6  # rad^2; below it the leading terms of power series are exact to 1e-18
 _POLE = 3 / 1024  # exact in every precision
 
 
+def _components(v: Float[Array, " n"] | list[Array], size: int) -> list[Float[Array, ""]]:
+    """Components of one quaternion or vector. A batch is an error, because its rows could pass for components."""
+    given = (len(v),) if isinstance(v, list) else jnp.shape(v)
+    if given != (size,):
+        raise UserError(f"argument of a rotation has shape {given}; expected ({size},); use jax.vmap for teams")
+    return components(v)
+
+
 def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Hamilton product p q: first the rotation q, then p."""
-    a, b, c, d = components(p)
-    x, y, z, w = components(q)
+    a, b, c, d = _components(p, 4)
+    x, y, z, w = _components(q, 4)
     return jnp.stack(
         [
             d * x + a * w + b * z - c * y,
@@ -31,31 +40,31 @@ def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 def conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Inverse rotation of a unit quaternion."""
-    x, y, z, w = components(q)
+    x, y, z, w = _components(q, 4)
     return jnp.stack([-x, -y, -z, w])
 
 
 def rotate(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """R v: a vector from the body frame to the world frame, v + w t + u x t with t = 2 u x v and q = (u, w)."""
-    x, y, z, w = components(q)
+    x, y, z, w = _components(q, 4)
     return _rotate(x, y, z, w, v)
 
 
 def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """R^T v: a vector from the world frame to the body frame."""
-    x, y, z, w = components(q)
+    x, y, z, w = _components(q, 4)
     return _rotate(x, y, z, -w, v)
 
 
 def _rotate(x: Array, y: Array, z: Array, w: Array, v: Array) -> Array:
-    vx, vy, vz = components(v)
+    vx, vy, vz = _components(v, 3)
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
     return jnp.stack([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx])
 
 
 def axes(q: Float[Array, "4"]) -> list[Float[Array, "3"]]:
     """R e_x, R e_y, R e_z: the body axes in the world frame, the columns of the rotation matrix."""
-    x, y, z, w = components(q)
+    x, y, z, w = _components(q, 4)
     return [
         jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
         jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
@@ -70,13 +79,14 @@ def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Unit quaternion along q (not zero)."""
-    norm = jnp.sqrt(dot(q, q))
-    return jnp.stack([x / norm for x in components(q)])
+    parts = _components(q, 4)
+    norm = jnp.sqrt(dot(parts, parts))
+    return jnp.stack([x / norm for x in parts])
 
 
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
     """Rotation by |v| rad about v; smooth at zero."""
-    square = dot(v, v) / 4  # of half the angle
+    square = dot(_components(v, 3), v) / 4  # of half the angle
     small = square < _SMALL
     half = jnp.sqrt(jnp.maximum(square, _SMALL))
     sin, cos = sin_cos(half)
@@ -86,7 +96,7 @@ def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
 
 def log(q: Float[Array, "4"]) -> Float[Array, "3"]:
     """Rotation vector (rad) of a unit quaternion, at most half a turn: the inverse of `exp`; smooth at zero."""
-    sign = jnp.where(q[3] < 0, -1, 1)
+    sign = jnp.where(_components(q, 4)[3] < 0, -1, 1)
     v, w = sign * q[:3], sign * q[3]
     square = dot(v, v)  # of the sine of half the angle
     sine = jnp.sqrt(jnp.maximum(square, _SMALL))
@@ -117,7 +127,7 @@ def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     """Quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    (sr, cr), (sp, cp), (sy, cy) = [sin_cos(angle / 2) for angle in components(rpy)]
+    (sr, cr), (sp, cp), (sy, cy) = [sin_cos(angle / 2) for angle in _components(rpy, 3)]
     return jnp.stack(
         [
             sr * cp * cy - cr * sp * sy,
@@ -135,7 +145,7 @@ def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
     This pole is where the sums or differences of components that vanish at +-90 degrees are at most 0.0029, within
     0.24 to 0.34 degrees of it.
     """
-    x, y, z, w = components(q)
+    x, y, z, w = _components(q, 4)
     up = (jnp.abs(w - y) <= _POLE) & (jnp.abs(x + z) <= _POLE)
     down = (jnp.abs(w + y) <= _POLE) & (jnp.abs(x - z) <= _POLE)
     pole = up | down  # of sums with a common rounding, so that the three angles use the same branch

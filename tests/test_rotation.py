@@ -1,5 +1,7 @@
 """Quaternions against scipy, against recorded conversions, and smooth where formulas tend to break."""
 
+import re
+
 import golden_data
 import jax
 import jax.numpy as jnp
@@ -54,6 +56,13 @@ def test_the_z_axis_is_the_last_column_of_the_matrix():
 def test_cross_is_the_vector_product():
     a, b = vectors[:25], vectors[25:]
     np.testing.assert_allclose(each(vector.cross, a, b), np.cross(a, b), atol=ROUND_OFF)
+
+
+@pytest.mark.parametrize("name", ["conjugate", "normalize", "log", "z_axis", "to_matrix", "to_rpy", "exp", "from_rpy"])
+def test_a_batch_is_an_error_also_where_its_rows_could_pass_for_components(name):
+    batch = jnp.array(vectors[:3] if name in ("exp", "from_rpy") else quats[:4])
+    with pytest.raises(ValueError, match=re.escape(f"shape {batch.shape}; expected ({len(batch)},); use jax.vmap")):
+        getattr(rotation, name)(batch)
 
 
 def test_normalize_gives_unit_length_and_keeps_the_direction():

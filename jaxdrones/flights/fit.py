@@ -60,7 +60,11 @@ class Report:
     per_flight: dict[str, dict[str, float]]
     """Values of the per-flight parameters, by flight and name, SI units."""
     losses: tuple[float, ...]
-    """Loss after each round: of the validation flights, or without these of the fitted ones."""
+    """Loss after each round: of the validation flights, or without these of the fitted ones.
+
+    The loss of fitted flights is relative to the residuals of the round before. That of the first round is relative to
+    fixed scales, and not comparable with the others.
+    """
     errors: dict[str, np.ndarray]
     """Open-loop errors (horizons, 4) of the fitted vehicle by flight, validation flights included."""
 
@@ -212,7 +216,9 @@ class _Problem:
             if k < len(active) - 1:
                 continue
             loss = self._validation_loss(x, validate) if validate else float(normal.loss)
-            progress(f"round {k + 1} of {len(active) + _ROUNDS}: {'validation' if validate else 'loss'} {loss:.4g}")
+            relative = "" if validate or k < len(active) else f" (relative to the residuals of round {k})"
+            kind = "validation" if validate else "loss"
+            progress(f"round {k + 1} of {len(active) + _ROUNDS}: {kind} {loss:.4g}{relative}")
             if not validate or loss < best[0]:
                 best = (loss, x, normal)
             losses.append(loss)

@@ -57,18 +57,19 @@ class Layout:
         Raises:
             ValueError: a missing action, a wrong shape, or NaN (of a batch or a traced action, only in NumPy arrays).
         """
+        meaning = f"{self.size} numbers"
         if not self.names:
             alone = self.drones == 1
-            meaning = f"{self.size} numbers" if alone else f"{self.size} numbers for each of {self.drones} drones"
+            meaning += "" if alone else f" for each of {self.drones} drones"
             shape = (*batch, self.size) if alone else (*batch, self.drones, self.size)
             action = _check(action, "action", shape, meaning, batch)
             return action[..., None, :] if alone else action
         if not isinstance(action, Mapping) or set(action) != set(self.names):
             given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
             raise UserError(
-                f"action is for {given or 'no drone'}; give a dict with one each for {', '.join(self.names)}"
+                f"actions are for {given or 'no drone'}; give a dict with an action for each of {', '.join(self.names)}"
             )
-        rows = [_check(action[name], f"action of {name}", (*batch, self.size), "", batch) for name in self.names]
+        rows = [_check(action[name], f"action of {name}", (*batch, self.size), meaning, batch) for name in self.names]
         stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
         return stack(rows, axis=len(batch))
 

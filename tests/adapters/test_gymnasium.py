@@ -154,7 +154,7 @@ def test_mistakes_are_named(env_of):
         GymnasiumEnv(short(env_of), backend="explicit")
     by_drone = GymnasiumEnv(env_of("leader-follower"), dict_spaces=True)
     by_drone.reset(seed=0)
-    with pytest.raises(ValueError, match="action is for 0; give a dict with one each for 0, 1"):
+    with pytest.raises(ValueError, match="actions are for 0; give a dict with an action for each of 0, 1"):
         by_drone.step({"0": np.zeros(1)})
 
 

@@ -88,7 +88,9 @@ def test_a_discrete_action_is_a_row_of_the_table(env_of):
 def test_an_agent_without_an_action_is_named(env_of):
     env = jaxmarl.wrap(env_of("hover", drones=2, duration=0.02))
     _, state = env.reset(KEY)
-    with pytest.raises(ValueError, match="action is for drone_0; give a dict with one each for drone_0, drone_1"):
+    with pytest.raises(
+        ValueError, match="actions are for drone_0; give a dict with an action for each of drone_0, drone_1"
+    ):
         env.step(KEY, state, {"drone_0": jnp.zeros(4)})
 
 

@@ -49,11 +49,13 @@ def test_the_state_is_what_all_agents_see(env_of):
 def test_mistakes_are_named(env_of):
     env = parallel_env(env_of("hover", drones=2, duration=0.05))
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="action is for drone_0; give a dict with one each for drone_0, drone_1"):
+    with pytest.raises(
+        ValueError, match="actions are for drone_0; give a dict with an action for each of drone_0, drone_1"
+    ):
         env.step({"drone_0": np.zeros(4)})
-    with pytest.raises(ValueError, match="give a dict with one each for drone_0, drone_1"):
+    with pytest.raises(ValueError, match="give a dict with an action for each of drone_0, drone_1"):
         env.step([np.zeros(4), np.zeros(4)])
-    with pytest.raises(ValueError, match=r"action of drone_1 has shape \(3,\); expected \(4,\)"):
+    with pytest.raises(ValueError, match=r"action of drone_1 has shape \(3,\); expected \(4,\): 4 numbers"):
         env.step({"drone_0": np.zeros(4), "drone_1": np.zeros(3)})
     with pytest.raises(ValueError, match="action of drone_1 is not finite"):
         env.step({"drone_0": np.zeros(4), "drone_1": np.full(4, np.nan)})

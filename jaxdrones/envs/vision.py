@@ -100,10 +100,10 @@ class Vision:
         known = {
             "rgb": ImageSpace((*shape, 4), np.uint8, 0, 255, "red, green, blue and opacity"),
             "depth": ImageSpace(
-                shape, np.float32, 0.0, self.camera.far, "m along the viewing axis, the highest where nothing is"
+                shape, np.float32, 0.0, self.camera.far, "m along the viewing axis; the upper bound for the background"
             ),
             "segmentation": ImageSpace(
-                shape, np.int32, -1, drones + obstacles, "-1 nothing, 0 ground, then the drones, then the obstacles"
+                shape, np.int32, -1, drones + obstacles, "-1 background, 0 ground, then the drones, then the obstacles"
             ),
         }
         return {name: known[name] for name in self.images}

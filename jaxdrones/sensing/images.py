@@ -38,7 +38,7 @@ class Images(PyTreeNode):
     depth: Array
     """(n, h, w) depth along the viewing axis, m; `far` for empty pixels."""
     segmentation: Array
-    """(n, h, w) int32: -1 nothing, 0 ground, 1 + i drone i, 1 + n + j obstacle j."""
+    """(n, h, w) int32: -1 background, 0 ground, 1 + i drone i, 1 + n + j obstacle j."""
 
 
 _DEFAULT = Camera()

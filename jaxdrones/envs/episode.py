@@ -145,10 +145,10 @@ def outcome(
     terminated = task.shared(jnp.any, _any_of(terminations, jnp.zeros_like(active)))
     cut = task.shared(jnp.any, _any_of(truncations, jnp.zeros_like(active)))
     truncated = cut | active & (world.step >= env.steps)
-    if task.ends == "drone":  # a step after the time limit is like any other
-        world = world.replace(active=active & ~(terminated | cut))
     info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
     info |= dict(active=active, terminated=terminated, truncated=truncated)
+    if task.ends == "drone":  # a step after the time limit is like any other
+        world = world.replace(active=active & ~(terminated | cut))
     obs = _noisy_observation(env, key, world)
     return obs, world, sum(rewards.values()), *_ends_of_team(env, world, terminated, truncated), info
 

@@ -94,6 +94,22 @@ def test_the_others_fly_on_and_the_team_ends_with_the_last():
     assert ends.index(True) == max(int(np.argmax([x[4]["terminated"][i] for x in both])) for i in range(2))
 
 
+def test_rewards_and_metrics_of_a_step_are_those_of_the_same_drones():
+    """A drone whose episode ends in a step is among them; a metric of its last step may not miss it."""
+
+    def present(task, world):
+        """1 for drones in the world."""
+        return world.active.astype(float)
+
+    *_, infos = zip(
+        *flown(column(rewards={"present": (1.0, present)}, metrics={"present": present}), [-1.0, 0.0]), strict=True
+    )
+    assert sum(info["terminated"][0] for info in infos) == 1
+    for info in infos:
+        np.testing.assert_array_equal(info["metrics"]["present"], info["active"])
+        np.testing.assert_array_equal(info["rewards"]["present"], info["active"])
+
+
 @pytest.mark.slow
 def test_a_team_whose_last_drone_is_cut_is_cut_and_not_terminated():
     """A learner goes on from the value there; so it does where the others had ended before."""

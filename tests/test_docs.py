@@ -36,6 +36,13 @@ def test_every_file_that_a_page_names_is_there():
     assert missing == []
 
 
+def test_the_source_of_every_function_that_a_page_shows_is_a_line_of_its_own():
+    """Elsewhere the site does not show it (website/hook.py)."""
+    for page in PAGES:
+        in_text = page.read_text().replace("`<!-- code:", "")  # that of CONTRIBUTING.md, which explains it
+        assert in_text.count("<!-- code:") == len(re.findall(r"^<!-- code: \S+ \w+ -->$", in_text, re.M)), page.name
+
+
 def test_every_commit_of_a_number_is_in_the_history():
     """A commit that was rewritten afterwards reproduces nothing."""
     named = {

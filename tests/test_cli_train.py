@@ -185,11 +185,12 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
 
 def test_a_policy_of_another_vehicle_than_that_of_the_training_is_named(capsys, monkeypatch):
     """--from keeps its parameters only."""
-    run = argparse.Namespace(recipe=lambda: Recipe.of("hover", vehicle="racer"), policy=lambda: None)
+    run = argparse.Namespace(recipe=lambda: Recipe.of("hover", vehicle="racer"), policy=lambda env: None)
     monkeypatch.setattr(train_request, "open_policy", lambda *_: run)
     for options, warned in ([], True), (["--vehicle", "racer"], False), (["--vehicle", "hb"], False):
         options = make_parser().parse_args(["train", "hover", "--from", "runs/racer", *options])
-        Request.of(options).first_policy()
+        request = Request.of(options)
+        request.first_policy(request.recipe({}))
         warning = "runs/racer was trained with the vehicle racer, .* this training is with cf2x; give --vehicle racer"
         assert bool(re.search(warning, capsys.readouterr().err)) == warned
 
@@ -429,14 +430,14 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--sweep", "horizon=2", "--sweep", "horizon=3"], "--sweep horizon is given twice"),
         (["train", "hover", "--sweep", "gamma=0.9,0.99,0.90"], "--sweep has gamma=0.9 twice"),
         (["train", "hover", "--sweep", "gamma=0.9,2"], "gamma is 2.0; give a number of at least 0 and at most 1"),
-        (["train", "hover", "--sweep", "worlds=8,many"], "worlds is 'many'; give something like 256"),
+        (["train", "hover", "--sweep", "worlds=8,many"], "worlds is 'many'; give a value such as 256"),
         (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config=none.toml"], "--config none.toml cannot be read"),
         (["train", "hover", "--config", "none.toml", "--config=none.toml"], "--config is given twice"),
         (["train", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),
         (["train", "hover", "--algo", "pppo"], "unknown algorithm 'pppo'; did you mean 'ppo'"),
         (["train", "hover", "--set", "wrlds=3"], "unknown setting 'wrlds'; did you mean 'worlds'"),
-        (["train", "hover", "--set", "worlds=2.5"], "worlds is 2.5; give something like 256"),
+        (["train", "hover", "--set", "worlds=2.5"], "worlds is 2.5; give a value such as 256"),
         (["train", "hover", "--set", "worlds=0"], "worlds is 0"),
         (["train", "hover", "--set", "worlds"], "give NAME=VALUE"),
         (["train", "hover", "--algo", "ppo", "--set", "worlds=6"], "give a multiple of minibatches, 8"),
@@ -449,6 +450,12 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--from", "hovr"], "hovr is not a bundled policy; did you mean 'hover'"),
         (["train", "hover", "--from", "raptor"], "give the folder of a run or the name of a bundled policy"),
         (["train", "tracking", "--from", "hover"], "the environment tracking"),
+        (
+            ["train", "hover", "--from", "hover", "--set", "action=thrust_and_rates"],
+            "the policy of hover was trained with observation=position_error,rotation_matrix,velocity_error,omega,"
+            "last_action action=rpm, the environment hover has observation=position_error,rotation_matrix,"
+            "velocity_error,omega,last_action action=thrust_and_rates; give those of the policy",
+        ),
         (["train", "hover", "--from", "hover", "--set", "hidden_sizes=8,"], "-> 8 -> 4, tanh, 220 parameters"),
         (["train", "hover", "--algo", ""], "unknown algorithm ''"),
         (["train", "hover", "--seed", "-1"], "seed is -1"),

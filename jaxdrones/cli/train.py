@@ -175,7 +175,8 @@ def _train_row(request: Request, begin: float, results: list) -> int:
                 stack.enter_context(locked(folder, print_warning))
             runs = request.runs()
             with user_mistakes(request.settings, request.task):
-                trainer = Trainer(request.recipe(runs), request.episodes_of(runs), request.first_policy())
+                recipe = request.recipe(runs)
+                trainer = Trainer(recipe, request.episodes_of(runs), request.first_policy(recipe))
             for run in runs.values():
                 if run.started and request.resume:
                     loop.check_resumable(trainer, run)

@@ -15,6 +15,7 @@ from jaxdrones.cli.settings import given_settings, parse_value
 from jaxdrones.errors import UserError
 from jaxdrones.learning.loggers import logger_names
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.policies import check_terms, terms_of
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.pytree import as_tuple
 from jaxdrones.training import user_files
@@ -107,8 +108,8 @@ class Request(argparse.Namespace):
         started = (run.sidecar_entry("state", "episodes") for run in runs.values() if run.started and self.resume)
         return next(started, 1000 if self.episodes is None else self.episodes)
 
-    def first_policy(self) -> Policy | None:
-        """Policy of --from."""
+    def first_policy(self, recipe) -> Policy | None:
+        """Policy of --from for a training by `recipe`."""
         if self.start_from is None:
             return None
         if is_user_policy(self.start_from):
@@ -120,7 +121,10 @@ class Request(argparse.Namespace):
                 f"the policy of {self.start_from} was trained with the vehicle {had}, and --from keeps only its "
                 f"parameters: this training is with cf2x; give --vehicle {had} for the same"
             )
-        return run.policy()
+        env = recipe.env()
+        policy = run.policy(env=env)
+        check_terms(f"of {self.start_from}", terms_of(run.recipe().env()), env)
+        return policy
 
     def _new_recipe(self, runs: dict):
         algorithm = default_algorithm(self.task) if self.algo is None else self.algo

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import assets
 from jaxdrones.checks import look_up
-from jaxdrones.envs import Env
+from jaxdrones.envs import TASKS, Env
 from jaxdrones.errors import UserError, needs
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.adaptive import AdaptivePolicy
@@ -85,7 +85,7 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
         name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or a policy for all vehicles:
             `any-vehicle` (bundled) or `raptor` (published).
         env: environment of the policy, whose observations and actions are checked. Optional for the bundled policy of
-            a task, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
+            a task, which is for `jaxdrones.make(name)` and environments with the same observations and actions.
 
     Raises:
         ValueError: an unknown name, or an environment with other observations or actions than the policy has.
@@ -97,10 +97,27 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
         policy = checkpoint.load(found / "best")
         if env is not None:
             check_fits(name, policy, env)
+            task = TASKS[name]()
+            check_terms(name, (*task.observation, task.action), env)
         return policy
     if env is None:
         raise UserError(f"{name} adapts to a vehicle; give its environment, for example make_policy({name!r}, env)")
     return AdaptivePolicy.of(name, found(), env)
+
+
+def terms_of(env: Env) -> tuple[str, ...]:
+    """Names of the observation terms and of the action type of an environment."""
+    return (*(term.name for term in env.terms), env.action.name)
+
+
+def check_terms(name: str, trained: tuple[str, ...], env: Env) -> None:
+    """Raise unless an environment has the observation terms and the action type `trained` of a policy called `name`."""
+    own, given = (f"observation={','.join(names)} action={action}" for *names, action in (trained, terms_of(env)))
+    if own != given:
+        raise UserError(
+            f"the policy {name} was trained with {own}, the environment {env.task.name} has {given}; give those of the "
+            "policy"
+        )
 
 
 def check_fits(name: str, policy: Policy, env: Env) -> None:

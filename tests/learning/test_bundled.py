@@ -58,6 +58,12 @@ def test_what_cannot_be_flown_is_refused():
         ValueError, match=r"the policy forest has \d+ observations and 4 actions, the environment hover 22"
     ):
         jd.make_policy("forest", jd.make("hover"))
+    swapped = ("position_error", "velocity_error", "rotation_matrix", "omega", "last_action")  # as many entries
+    for options in {"observation": swapped}, {"action": "thrust_and_rates"}:
+        with pytest.raises(
+            ValueError, match=r"hover was trained with observation=position_error,rotation_matrix,.*; give"
+        ):
+            jd.make_policy("hover", jd.make("hover", **options))
     with pytest.raises(ValueError, match=r"unknown policy 'forrest'; did you mean 'forest'\?"):
         jd.make_policy("forrest")
     with pytest.raises(ValueError, match=r"raptor adapts to a vehicle; give its environment"):

@@ -94,7 +94,7 @@ class Params(PyTreeNode):
 
     @property
     def relative_density(self) -> Array:
-        """() air density over that of the coefficients."""
+        """() air density relative to that of the rotor coefficients, 1.225 kg/m^3."""
         return self.air_density / AIR_DENSITY
 
     @property

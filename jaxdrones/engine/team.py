@@ -49,7 +49,7 @@ def check_team(params: Params, state: State, rpm: Any) -> None:
 
 def _check_aux(name: str, aux: Any, n: int) -> None:
     if not isinstance(aux, dict):
-        raise UserError(f"{name} is {short_repr(aux)}; give a dictionary by the names of models")
+        raise UserError(f"{name} is {short_repr(aux)}; give a dictionary with names of models as keys")
     for path, leaf in jax.tree_util.tree_leaves_with_path(aux):
         where = name + jax.tree_util.keystr(path)
         if jnp.shape(leaf)[:1] != (n,):

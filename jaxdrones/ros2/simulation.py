@@ -42,11 +42,11 @@ class Simulation:
         """Start a flight with every drone holding its position.
 
         Args:
-            step: of either backend, for one control period.
-            params: of a team.
+            step: step of either backend, for one control period.
+            params: parameters of a team.
             state: initial state of the team.
             control_hz: control steps per second.
-            controller: of positions and velocities, a name of `CONTROLLERS`; by default the vehicle's.
+            controller: name of the controller of positions and velocities in `CONTROLLERS`; by default the vehicle's.
             battery: readings of the battery of one drone as a function of its state; by default none.
             scene: obstacles; by default those of the step, and none in images of the explicit backend.
         """

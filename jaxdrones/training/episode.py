@@ -1,4 +1,4 @@
-"""Episodes of a policy, on either backend, and of those in the history of a training, and their logs."""
+"""Episodes of a policy or of the policies in the history of a training, on either backend, and their logs."""
 
 import functools
 import math

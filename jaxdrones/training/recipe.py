@@ -129,5 +129,5 @@ def convert_setting(name: str, value: Any, current: Any) -> Any:
     if isinstance(current, tuple) and isinstance(value, list):
         value = tuple(value)
     if current is not None and type(value) is not type(current):
-        raise UserError(f"{name} is {value!r}; give something like {current!r}")
+        raise UserError(f"{name} is {value!r}; give a value such as {current!r}")
     return value

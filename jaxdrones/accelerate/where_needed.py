@@ -108,7 +108,7 @@ def _batched(
 def _differentiated(
     primals: Sequence, tangents: Sequence, *, program: Any, rest: int, mapped: tuple, **params: Any
 ) -> tuple:
-    """Results, and their changes by the program of the changes of one world."""
+    """Results and their tangents, computed by the differentiated program of one world."""
     results = _where.bind(*primals, program=program, rest=rest, mapped=mapped, **params)
     needed, inputs = primals[0], primals[1 + rest :]
     of_otherwise, changes = tangents[1 : 1 + rest], tangents[1 + rest :]

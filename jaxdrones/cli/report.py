@@ -83,7 +83,7 @@ def table(results: list[dict]) -> str:
 
 
 def described(recipe, **more: Any) -> str:
-    """Title of a recipe: task, learner and options, with `more` of them, such as `hover by bptt`."""
+    """Title of a recipe: task, learner, options and the entries of `more`, such as `hover by bptt`."""
     options = "".join(f", {name} {x}" for name, x in (recipe.options | more).items())
     return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
 

@@ -118,7 +118,7 @@ class KeepBest:
 
     @checked
     def __init__(self, env: Env, key: jax.Array, every: Count = 20, episodes: Count = 200):
-        """Evaluate in `env` after `every` updates, in the same `episodes` of a random key for all policies."""
+        """Evaluate in `env` after `every` updates, always on the same `episodes`, which depend on `key`."""
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
         self._score: Score | None = None

@@ -164,7 +164,7 @@ def landing(
 def settled(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds.
 
-    It was not in an episode of fewer control steps.
+    False for an episode shorter than that.
     """
     steps = round(SETTLED / dt)
     near = (metrics["error"][-steps:] < 0.05) & (metrics["speed"][-steps:] < 0.1)

@@ -3,11 +3,16 @@
 import inspect
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.physics import Physics
+from jaxdrones.envs import episode
 from jaxdrones.envs.actions import Action
+from jaxdrones.envs.env import Env
+from jaxdrones.envs.functions import check_kept, is_own, kind_of, shape_of, where_is
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 
@@ -42,3 +47,24 @@ def check_action(name: str | None, action: Action, params: Params, rotors: Any, 
             f"{_MAX_ROTOR_TIME} s; this vehicle has {time:.2g} s; give rotors='instant', or an "
             "action type that commands rotors, thrust and torques, or rates"
         )
+
+
+def check_command(env: Env) -> None:
+    """Raise unless a user's action type returns its memory and four rotor speeds, by tracing it."""
+    action = env.action
+    if is_own(action.rpm):
+        return
+    where = where_is("action", action.rpm)
+
+    def trial(key: jax.Array) -> int:
+        world = episode.first_world(env, key)
+        params, state, target = jax.tree.map(lambda x: x[0], (world.params, world.drones, env.task.target_now(world)))
+        memory = action.init()
+        returned = action.rpm(params, memory, state, jnp.zeros(action.size), target, env.dt)
+        if not (isinstance(returned, tuple) and len(returned) == 2 and shape_of(returned[1]) == (4,)):
+            found = ", ".join(map(kind_of, returned)) if isinstance(returned, tuple) else kind_of(returned)
+            raise UserError(f"{where} returns {found}; return the memory and four rotor speeds (4,), RPM")
+        check_kept(where, "a memory", memory, returned[0])
+        return 0
+
+    jax.eval_shape(trial, jax.random.key(0))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import Count, checked, function
 from jaxdrones.control import Setpoint, attitude, for_team, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
@@ -24,15 +25,16 @@ _ROTORS = [f"speed of rotor {i}" for i in range(4)]
 _AHEAD = "way from the drone to the setpoint"
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Action:
     """Action type: functions of one drone."""
 
-    size: int
+    size: Count
     """Length of the action of one drone."""
-    rpm: Command
+    rpm: Annotated[Command, function("hover", ("params", "memory", "state", "action", "setpoint", "dt"))]
     """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
-    init: Callable[[], Any] = lambda: None
+    init: Annotated[Callable[[], Any], function("dict", ())] = lambda: None
     """() -> memory of one drone at the start of an episode."""
     for_vehicle: Callable[[Params], Action] | None = None
     """Nominal parameters of the team -> action type for this vehicle; `None` if independent of the vehicle."""

@@ -52,7 +52,7 @@ def scene_example(scene: Scene | DrawScene) -> Scene:
     return example
 
 
-def _is_own(function: Any) -> bool:
+def is_own(function: Any) -> bool:
     """Whether a function belongs to this library, and so needs no check."""
     return str(getattr(getattr(function, "func", function), "__module__", "")).startswith("jaxdrones.")
 
@@ -94,9 +94,9 @@ def check_episode(
 
     lengths = [x.shape[-1] for x in jax.eval_shape(sizes, jax.random.key(0))]
     for function in draws:
-        if not _is_own(function):
+        if not is_own(function):
             _check_values("a randomization", function, lambda key, draw=function: draw(key, one), check_params)
-    if not _is_own(task.start):
+    if not is_own(task.start):
         check = functools.partial(check_state, "state")
         _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], check)
     return lengths
@@ -116,17 +116,17 @@ def _check_values(what: str, function: Callable, draw: Callable, check: Callable
         for i in range(_DRAWS):
             check(jax.tree.map(lambda x, i=i: x[i], drawn))
     except UserError as error:
-        raise UserError(f"{_where(what, function)} returns values that cannot fly: {error}") from None
+        raise UserError(f"{where_is(what, function)} returns values that cannot fly: {error}") from None
 
 
 def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:
     """Raise unless a task's start returns the state of the team and the task's variables."""
-    if _is_own(task.start):
+    if is_own(task.start):
         return
-    where, n = _where("start", task.start), task.drones
+    where, n = where_is("start", task.start), task.drones
     returned = task.begin(key, params, _scene_of(scene, key))
     if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], State)):
-        raise UserError(f"{where} returns {_kind(returned)}; return a State of the team and the task's variables")
+        raise UserError(f"{where} returns {kind_of(returned)}; return a State of the team and the task's variables")
     _check_like(where, "a state", returned[0], State.at_rest(jnp.zeros((n, 3))))
     _check_arrays(f"{where} returns variables", returned[1])
 
@@ -134,25 +134,25 @@ def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None
 def equipped(task: Task, params: Params) -> Params:
     """Parameters of a team with the constants of the task's models."""
     returned = task.equip(params)
-    if not _is_own(task.equip):
-        where, n = _where("equip", task.equip), task.drones
+    if not is_own(task.equip):
+        where, n = where_is("equip", task.equip), task.drones
         if not isinstance(returned, Params):
-            raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
+            raise UserError(f"{where} returns {kind_of(returned)}; return params.replace(...)")
         _check_like(where, "parameters", returned, params)
         check_params(returned)
         for leaf in jax.tree.leaves(returned.aux):
-            if (_shape(leaf) or ())[:1] != (n,):
-                raise UserError(f"{where} returns parameters whose aux has {_kind(leaf)}; give an array ({n}, ...)")
+            if (shape_of(leaf) or ())[:1] != (n,):
+                raise UserError(f"{where} returns parameters whose aux has {kind_of(leaf)}; give an array ({n}, ...)")
     return returned
 
 
 def _check_replaced(what: str, function: Callable, key: jax.Array, given: State | Params, *dt: float) -> None:
     """Raise unless a function of a state or of parameters returns one with arrays of the same shapes."""
     returned = function(key, given, *dt)
-    if not _is_own(function):
-        where, name = _where(what, function), "params" if isinstance(given, Params) else "state"
+    if not is_own(function):
+        where, name = where_is(what, function), "params" if isinstance(given, Params) else "state"
         if not isinstance(returned, type(given)):
-            raise UserError(f"{where} returns {_kind(returned)}; return {name}.replace(...)")
+            raise UserError(f"{where} returns {kind_of(returned)}; return {name}.replace(...)")
         _check_like(where, {"params": "parameters", "state": "a state"}[name], returned, given)
 
 
@@ -160,17 +160,17 @@ def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> 
     """Raise unless each observation term returns a row of numbers for every drone."""
     n = task.drones
     for term in terms:
-        if _is_own(term.observe):
+        if is_own(term.observe):
             continue
-        where = _where(f"observation {term.name!r}", term.observe)
+        where = where_is(f"observation {term.name!r}", term.observe)
         x = term.observe(task, world)
-        shape = _shape(x)
+        shape = shape_of(x)
         if shape is None or len(shape) != 2 or shape[0] != n or shape[1] == 0:
-            raise UserError(f"{where} returns {_kind(x)}; return an array ({n}, d), one row for every drone")
+            raise UserError(f"{where} returns {kind_of(x)}; return an array ({n}, d), one row for every drone")
         if jnp.result_type(x).kind not in "iuf":
-            raise UserError(f"{where} returns {_kind(x)}; return real numbers")
-        if _shape(again := term.observe(task, world)) != shape:
-            raise UserError(f"{where} returns {_kind(x)}, and {_kind(again)} when called again; keep its shape")
+            raise UserError(f"{where} returns {kind_of(x)}; return real numbers")
+        if shape_of(again := term.observe(task, world)) != shape:
+            raise UserError(f"{where} returns {kind_of(x)}, and {kind_of(again)} when called again; keep its shape")
         if term.rows and shape[1] % term.rows:
             raise UserError(f"{where} returns {shape[1]} numbers in {term.rows} rows; give rows of equal length")
         for name, given in ("bound", term.bound), ("entries", term.entries):
@@ -181,14 +181,14 @@ def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> 
 def _check_functions(task: Task, world: World, dt: float) -> None:
     """Validate target, rewards, conditions, metrics, `advance` and `success` in a traced world at the start."""
     n = task.drones
-    if not _is_own(task.target):
-        where, target = _where("target", task.target), task.target(world.variables, world.time)
+    if not is_own(task.target):
+        where, target = where_is("target", task.target), task.target(world.variables, world.time)
         if not isinstance(target, Setpoint):
-            raise UserError(f"{where} returns {_kind(target)}; return Setpoint.at(pos), pos of shape ({n}, 3)")
+            raise UserError(f"{where} returns {kind_of(target)}; return Setpoint.at(pos), pos of shape ({n}, 3)")
         _check_like(where, "a target", target, Setpoint.at(jnp.zeros((n, 3))))
-    if not _is_own(task.advance):
-        where = _where("advance", task.advance)
-        _check_kept(where, "variables", world.variables, task.advance(task, world))
+    if not is_own(task.advance):
+        where = where_is("advance", task.advance)
+        check_kept(where, "variables", world.variables, task.advance(task, world))
     for name, (_, term) in task.rewards.items():
         _check_one_each(f"reward {name!r}", term, n, (task, world))
     for kind, conditions in ("termination", task.terminations), ("truncation", task.truncations):
@@ -211,16 +211,16 @@ def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> No
             _check_arrays(f"{name}: initial_hidden_state returns a hidden state", state)
             returned = policy.act(state, obs)
             if not (isinstance(returned, tuple) and len(returned) == 2):
-                raise UserError(f"{name}: act returns {_kind(returned)}; return the hidden state and the actions")
-            _check_kept(f"{name}: act", "hidden state", state, returned[0])
+                raise UserError(f"{name}: act returns {kind_of(returned)}; return the hidden state and the actions")
+            check_kept(f"{name}: act", "hidden state", state, returned[0])
             action = returned[1]
         else:
             action = policy(obs)
-        if _shape(action) != shape:
+        if shape_of(action) != shape:
             what = f"return actions of shape {shape}, one row for every drone"
-            raise UserError(f"{name} returns {_kind(action)}; {what}")
+            raise UserError(f"{name} returns {kind_of(action)}; {what}")
         if jnp.result_type(action).kind not in "iuf":
-            raise UserError(f"{name} returns {_kind(action)}; return real numbers")
+            raise UserError(f"{name} returns {kind_of(action)}; return real numbers")
         return 0
 
     jax.eval_shape(act, obs)
@@ -231,13 +231,13 @@ _ROWS = 100  # of the metrics for the trial call of `success`
 
 def _check_one_each(what: str, function: Callable, n: int, arguments: tuple, kinds: str = _NUMBERS) -> None:
     """Raise unless a function returns one number or boolean for each of n drones."""
-    if _is_own(function):
+    if is_own(function):
         return
     x = function(*arguments)
     wanted = "boolean" if kinds == "b" else "number"
-    if _shape(x) != (n,) or jnp.result_type(x).kind not in kinds:
-        where = _where(what, function)
-        raise UserError(f"{where} returns {_kind(x)}; return one {wanted} for every drone, an array ({n},)")
+    if shape_of(x) != (n,) or jnp.result_type(x).kind not in kinds:
+        where = where_is(what, function)
+        raise UserError(f"{where} returns {kind_of(x)}; return one {wanted} for every drone, an array ({n},)")
 
 
 def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
@@ -246,45 +246,48 @@ def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
             continue
         x = getattr(given, field)
         kinds = "f" if isinstance(wanted, State) else "iuf"  # a state is integrated
-        if _shape(x) != np.shape(like) or jnp.result_type(x).kind not in kinds:
+        if shape_of(x) != np.shape(like) or jnp.result_type(x).kind not in kinds:
             wants = f"give an array {np.shape(like)} of {like.dtype}"
-            raise UserError(f"{where} returns {what} whose {field} is {_kind(x)}; {wants}")
+            raise UserError(f"{where} returns {what} whose {field} is {kind_of(x)}; {wants}")
 
 
-def _check_kept(where: str, what: str, before: Any, after: Any) -> None:
+def check_kept(where: str, what: str, before: Any, after: Any) -> None:
     """Raise unless a tree keeps its structure, shapes and types from step to step."""
     _check_arrays(f"{where} returns {what}", after)
     leaves, structure = jax.tree.flatten(before)
     others, other = jax.tree.flatten(after)
     if str(structure) != str(other):
-        raise UserError(f"{where} returns {what} {other}, which were {structure}; return the same kind of tree")
+        raise UserError(f"{where} returns {what} {other}, not {structure}; return the same kind of tree")
     for x, y in zip(leaves, others, strict=True):
         same = jnp.result_type(x) == jnp.result_type(y) or getattr(x, "weak_type", not hasattr(x, "dtype"))
         if np.shape(x) != np.shape(y) or not same:
-            raise UserError(f"{where} returns {what} with {_kind(y)}, which was {_kind(x)}; keep its shape and type")
+            raise UserError(
+                f"{where} returns {what} with {kind_of(y)}, which was {kind_of(x)}; keep its shape and type"
+            )
 
 
 def _check_arrays(what: str, tree: Any) -> None:
     for leaf in jax.tree.leaves(tree):
-        if _shape(leaf) is None:
+        if shape_of(leaf) is None:
             raise UserError(f"{what} that hold {short_repr(leaf)}; give arrays and numbers")
 
 
-def _shape(x: Any) -> tuple[int, ...] | None:
+def shape_of(x: Any) -> tuple[int, ...] | None:
     """Shape of an array or a number; `None` otherwise."""
     if isinstance(x, jax.Array | np.ndarray | np.generic | bool | int | float | complex):
         return np.shape(x)
     return None
 
 
-def _kind(x: Any) -> str:
-    shape = _shape(x)
+def kind_of(x: Any) -> str:
+    """Shape and type of an array, or the representation of another value, for error messages."""
+    shape = shape_of(x)
     if isinstance(x, jax.Array | np.ndarray) and shape is not None:
         return f"an array {shape} of {x.dtype}"
     return short_repr(x)
 
 
-def _where(what: str, function: Any) -> str:
+def where_is(what: str, function: Any) -> str:
     """Role and location of a function of a task, for error messages."""
     where = place(function)
     return f"{where}: {what}" if where else what

@@ -19,7 +19,7 @@ from jaxdrones.engine.explicit import ExplicitStep, make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
-from jaxdrones.envs.action_checks import check_action
+from jaxdrones.envs.action_checks import check_action, check_command
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
@@ -194,6 +194,7 @@ def make(
             f"duration is {task.duration} s, {task.duration / dt:.3g} control steps of {dt:.4g} s; give 1 to "
             f"{_MAX_STEPS:.0e}"
         )
+    check_command(made)
     assert made.term_sizes  # checks the functions of the task
     if isinstance(given_scene, Scene):
         check_free_starts(task, nominal, given_scene)

@@ -185,3 +185,26 @@ def test_entries_of_an_observation_are_a_tuple_of_quantities(entries):
     term = ObservationTerm(height, 5.0, entries=lambda drones, action: entries)
     with pytest.raises(UserError, match=r"entries of the observation term .* is .*; give a tuple"):
         explain(jd.make(dataclasses.replace(TASK, observation=(term,))))
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (
+            lambda params, memory: memory,
+            r"takes \(params, memory\); give a function of \(params, memory, state, action",
+        ),
+        (lambda params, memory, state, action, setpoint, dt: action, r"returns an array \(4,\) .*; return the memory"),
+        (
+            lambda params, memory, state, action, setpoint, dt: (memory, action[:3]),
+            r"an array \(3,\) .*; return the mem",
+        ),
+        (
+            lambda params, memory, state, action, setpoint, dt: (state.pos, action),
+            r"with an array \(3,\) .*keep its sh",
+        ),
+    ],
+)
+def test_an_action_type_returns_its_memory_and_four_rotor_speeds(command, message):
+    with pytest.raises(UserError, match=message):
+        jd.make(TASK, action=jd.envs.Action(4, command, init=lambda: jnp.zeros(4)))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers import SMALL_OPTIONS
 
-from jaxdrones.cli import main, make_parser, train_request
+from jaxdrones.cli import main, make_parser, train_output, train_request
 from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
 from jaxdrones.cli.settings import parse_settings, with_config
@@ -401,6 +401,22 @@ def test_a_task_of_the_command_line_overrides_that_of_a_file(tmp_path):
         assert read.count("tracking") == 1 and "hover" not in read and "--seeds=2" in read
 
 
+def test_the_table_of_a_sweep_shows_the_best_seed_of_each_run():
+    def seed(number, success):
+        interval = [success, 1.0]
+        evaluation = dict(success=success, success_interval=interval, episodes=100, mean_return=100 * success)
+        return {"seed": number, "evaluation": evaluation}
+
+    results = [
+        {"output": "runs/a", "best_seed": 1, "seeds": [seed(0, 0.5), seed(1, 0.75)]},
+        {"output": "runs/b", "best_seed": 0, "seeds": [seed(0, 0.25), seed(1, 0.0)]},
+    ]
+    assert train_output.sweep_table(results).splitlines()[2:] == [
+        "  runs/a  75.00   75.0 %, 75 of 100, 95 % interval 75.00 to 100.00 %",
+        "  runs/b  25.00   25.0 %, 25 of 100, 95 % interval 25.00 to 100.00 %",
+    ]
+
+
 @pytest.mark.slow
 def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
     """Options of the command line override those of the file."""
@@ -414,7 +430,9 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         run = Run(tmp_path / "run" / f"horizon={horizon}")
         assert run.recipe().config.horizon == horizon and run.recipe().config.hidden_sizes == (8,)
         assert [row["update"] for row in run.history()] == [0, 1]
-    assert "hover by bptt, duration 0.2, horizon=2: 4 worlds x 2 control steps" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "hover by bptt, duration 0.2, horizon=2: 4 worlds x 2 control steps" in out
+    assert re.search(r"all runs of the sweep.*\n +run +return +success\n.*horizon=2 .*\n.*horizon=4 .*\n$", out)
     assert main(command) == 2 and "horizon=2 holds a finished training" in capsys.readouterr().err
     assert main([*command, "--overwrite", "--json"]) == 0
     results = json.loads(capsys.readouterr().out)["runs"]

@@ -156,7 +156,7 @@ def _train(options: argparse.Namespace) -> int:
         for request in requests if len(requests) > 1 else ():  # a mistake in the last one is found before the first
             with user_mistakes(request.settings, request.task):
                 request.recipe(request.runs())
-    results: list[dict[str, Any]] = []  # with --json
+    results: list[dict[str, Any]] = []
     code = 0
     for request in requests:
         code = _train_row(request, begin, results)
@@ -165,6 +165,8 @@ def _train(options: argparse.Namespace) -> int:
         begin = time.perf_counter()
     if options.json and results:
         print(as_json({"runs": results} if options.sweep else results[0]))
+    elif len(results) > 1:
+        print(train_output.sweep_table(results))
     return code
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import bar, print_warning
-from jaxdrones.cli.report import evaluation_table, percent
+from jaxdrones.cli.report import evaluation_table, percent, success
 from jaxdrones.cli.train_request import Request
+from jaxdrones.envs.explanation import aligned
 from jaxdrones.learning.evaluation import score_of, wilson_interval
 from jaxdrones.training.plan import best_of
 from jaxdrones.training.run import Run
@@ -166,6 +167,15 @@ def show_results(request: Request, runs: dict) -> dict[str, Any]:
     warn_of_failure(run, reports[best])
     result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
     return result | {"files": list(map(str, files))}
+
+
+def sweep_table(results: list[dict[str, Any]]) -> str:
+    """Table of the best policies of the runs of a sweep, given the results of `show_results`."""
+    rows = [["run", "return", "success"]]
+    for result in results:
+        (best,) = (x["evaluation"] for x in result["seeds"] if x["seed"] == result["best_seed"])
+        rows.append([result["output"], f"{best['mean_return']:.2f}", success(best)])
+    return "all runs of the sweep, their best policies:\n" + aligned(rows)
 
 
 def _print_results(output: Path, runs: dict, reports: dict[int, dict[str, Any]], files: list[Path]) -> None:

@@ -49,11 +49,11 @@ class Battery(PyTreeNode):
 @checked
 def lithium_polymer(
     capacity: Annotated[ArrayLike, number("A s", "{argument} of the battery", above=0)] = 900.0,
-    cells: Annotated[ArrayLike, number("in series", "{argument} of the battery", above=0)] = 1,
+    cells: Annotated[ArrayLike, number("", "{argument} of the battery", above=0)] = 1,
     resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.28,
     slow_resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.0,
     slow_time: Annotated[ArrayLike, number("s", "{argument} of the battery", above=0)] = 10.0,
-    efficiency: Annotated[ArrayLike, number("a share", "{argument} of the battery", above=0)] = 0.3,
+    efficiency: Annotated[ArrayLike, number("", "{argument} of the battery", above=0, at_most=1)] = 0.3,
     idle_power: Annotated[ArrayLike, number("W", "{argument} of the battery", at_least=0)] = 0.5,
 ) -> Battery:
     """Constants of a battery; the defaults are those of a Crazyflie 2.1 with 250 mAh.

@@ -133,6 +133,8 @@ def test_many_batteries_in_one_program_are_as_alone():
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match=r"capacity of the battery is -1; give a positive number \(A s\)"):
         jd.lithium_polymer(capacity=-1)
+    with pytest.raises(ValueError, match=r"efficiency of the battery is 30; give a number above 0 and at most 1"):
+        jd.lithium_polymer(efficiency=30)  # percent
     with pytest.raises(ValueError, match=r"resistance of the battery is -0.1; give a number of at least 0 \(ohm\)"):
         jd.lithium_polymer(resistance=-0.1)
     bare = jd.repeat(jd.load_params("cf2x"), 2)

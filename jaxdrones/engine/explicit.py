@@ -155,7 +155,7 @@ class ExplicitStep(Step):
         self.physics, self._scene, self.dt, self.substeps = physics, scene, dt, substeps
         self.integrator = describe([integrator])
         self._divides = integrator not in INTEGRATORS.values()  # a user's own may divide the physics step
-        self.period = dt * substeps  # s, of a call
+        self.period = dt * substeps
         self._check_scene(scene)
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)

@@ -22,6 +22,8 @@ class Step(abc.ABC):
     """Physics step, s."""
     substeps: int
     """Physics steps per call."""
+    period: float | None = None
+    """Duration of a call, s, if known."""
 
     @abc.abstractmethod
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:

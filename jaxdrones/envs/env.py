@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, ParamSpec, Self, TypeVar
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.disturbances import Disturbance, DisturbanceWithMemory, check_wind
+from jaxdrones.envs.episode import in_full_precision
 from jaxdrones.envs.functions import DrawScene, check_episode, check_process, scene_example
 from jaxdrones.envs.observations import PrivilegedObservation, bounds, deviations, observe
 from jaxdrones.envs.randomize import Noise, Randomization
@@ -26,23 +27,9 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
-P = ParamSpec("P")
-R = TypeVar("R")
-
 RowSet = tuple[int, int, int, float]
 """First column of a set in an observation, number of rows, length of a row, and reach (m); see `ObservationTerm`."""
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
-
-
-def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """Multiply the matrices of a function in the precision of their type; GPUs round float32 to 10 bits by default."""
-
-    @functools.wraps(function)
-    def called(*arguments: P.args, **named: P.kwargs) -> R:
-        with jax.default_matmul_precision("highest"):
-            return function(*arguments, **named)
-
-    return called
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -89,6 +76,7 @@ class Env:
 
     def __post_init__(self):
         check_process()
+        episode.check_period(self)
         of_team = [model.name for model in self.physics.physics.models if model.of_team]
         if of_team and self.task.ends == "drone":
             raise UserError(
@@ -240,8 +228,10 @@ class Env:
             meaning; see `Task.ends`.
 
         Raises:
-            ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).
+            ValueError: no random key, a world of another task, a wrong shape, or numbers that are not finite (unless
+                traced).
         """
+        episode.check_world(self, world)
         shape = self.drones, self.action_size
         check_shape("action", action, shape, "one row of the action type's size per drone", finite=True)
         # A program without random keys can be a single kernel.

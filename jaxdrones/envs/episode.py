@@ -2,15 +2,18 @@
 
 import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdrones.checks import short_repr
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import randomize
 from jaxdrones.envs.observations import observe
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import hold_between, init_sensors, measure_sensors
 from jaxdrones.state import State
@@ -19,8 +22,42 @@ from jaxdrones.tasks.task import World
 DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
 """Random streams to fold into a key, so that only used draws cost time."""
 
+P = ParamSpec("P")
+R = TypeVar("R")
 Key = Any  # a random key; `None` where nothing is drawn
 _AWAY, _APART = 1e4, 100.0  # m: place of the drones whose episode has ended, and distance between them
+
+
+def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """Multiply the matrices of a function in the precision of their type; GPUs round float32 to 10 bits by default."""
+
+    @functools.wraps(function)
+    def called(*arguments: P.args, **named: P.kwargs) -> R:
+        with jax.default_matmul_precision("highest"):
+            return function(*arguments, **named)
+
+    return called
+
+
+def check_period(env: Any) -> None:
+    """Raise unless a step of the physics takes one control period."""
+    period = env.physics.period
+    if period is not None and not math.isclose(period, env.dt, rel_tol=1e-6):
+        raise UserError(
+            f"dt is {env.dt:.4g} s, and a step of the physics takes {period:.4g} s; make another environment, with "
+            f"control_hz={1 / env.dt:.4g}"
+        )
+
+
+def check_world(env: Any, world: Any) -> None:
+    """Raise unless a world is of the task and the control period of an environment."""
+    if isinstance(world, World) and (world.task, world.dt) == (env.task.name, env.dt):
+        return
+    given = f"of the task {world.task!r}, dt {world.dt:.4g} s" if isinstance(world, World) else short_repr(world)
+    raise UserError(
+        f"world is {given}; the environment has the task {env.task.name!r}, dt {env.dt:.4g} s: give a world of its own "
+        "reset or step"
+    )
 
 
 def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
@@ -40,6 +77,7 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
         active=jnp.ones(env.drones, bool),
         dt=env.dt,
         scene=scene,
+        task=env.task.name,
     )
 
 

@@ -163,7 +163,7 @@ class SurrogateStep(Step):
     """
 
     def __init__(self, step: Step, surrogate: Callable[[Params, State, Array], State]):
-        self.physics, self._step = step.physics, step
+        self.physics, self.period, self._step = step.physics, step.period, step
 
         @jax.custom_vjp
         def mixed(scene, params, state, rpm):

@@ -56,6 +56,8 @@ class World(PyTreeNode):
     """Latest camera images by name, those of `jaxdrones.make(vision=...)`."""
     poses: Any = None
     """(k, n, 7) poses at the last k control steps, oldest first, for images that are not yet observed."""
+    task: str = flax.struct.field(pytree_node=False, default="")
+    """Name of the task."""
 
     @property
     def time(self) -> Array:

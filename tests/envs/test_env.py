@@ -148,6 +148,20 @@ def test_a_replaced_field_acts_on_the_new_environment_alone():
         assert truncated == changed and (info["rewards"].keys() == {"one"}) == changed
 
 
+def test_a_control_period_is_that_of_the_physics():
+    with pytest.raises(ValueError, match=r"dt is 0.02 s, and a step of the physics takes 0.01 s; .* control_hz=50"):
+        dataclasses.replace(make_env("hover"), dt=0.02)
+
+
+@pytest.mark.parametrize("other", ["tracking", dataclasses.replace(jd.make("hover").task, control_hz=50.0)])
+def test_a_world_of_another_task_or_control_period_is_refused(other):
+    """Also where the worlds have the same arrays, as at another control period."""
+    env = make_env("hover")
+    world = make(other).reset(KEY)[1]
+    with pytest.raises(ValueError, match=r"world is .*; the environment has the task 'hover', dt 0.01 s"):
+        env.step(KEY, world, zeros(env))
+
+
 def test_an_episode_is_cut_after_its_duration_and_not_before():
     env = make("hover", duration=0.05)
     _, world = env.reset(KEY)

@@ -39,6 +39,7 @@ class BulletStep(HostStep):
 
     def __init__(self, client: Client, physics: Physics, substeps: int, dt: float, scene: Scene):
         self.client, self.physics, self.substeps, self.dt, self._scene = client, physics, substeps, dt, scene
+        self.period = dt * substeps
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
         self._compiled_loads = jit_small(self._loads, static=2)

@@ -52,8 +52,8 @@ def gates(
         random_start: for training: start in the air in front of a random gate with probability 0.8, else on the ground
             at the start of the track.
         start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
-        time_penalty: reward lost in every control step, and 60 times as much in a crash, so that it never pays to crash
-            early: for faster laps of a policy that already finishes them.
+        time_penalty: reward lost in every control step until the last gate, and 60 times as much in a crash, so that it
+            never pays to crash early: for faster laps of a policy that already finishes them.
     """
     scene = racetrack.scene_of(level)
 
@@ -104,7 +104,7 @@ def gates(
             "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         }
-        | ({"time": (-time_penalty, shaping.alive)} if time_penalty else {}),
+        | ({"time": (-time_penalty, _racing)} if time_penalty else {}),
         terminations={"finished": finished, "crashed": racetrack.crashed}
         | shaping.out_of_control(ARENA, center=MIDDLE),
         advance=_advance,
@@ -121,6 +121,11 @@ def gates(
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
     )
+
+
+def _racing(task: Task, world: World) -> Float[Array, " n"]:
+    """One in every step until the drone has passed all gates."""
+    return (world.variables["before"] < len(GATES)).astype(world.drones.pos.dtype)
 
 
 def _finished(metrics: Mapping[str, Array], dt: float) -> Array:

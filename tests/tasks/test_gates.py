@@ -53,9 +53,12 @@ def test_a_gate_is_passed_by_its_opening_hit_by_its_frame_and_missed_beside_it(a
 
 
 def test_the_time_penalty_costs_every_step_and_a_crash_sixty_of_them():
-    hurried = make("gates", time_penalty=0.5)
-    for aside, penalty in ((0.0, 0.5), (OPENING / 2 + FRAME / 2, 0.5 + 60 * 0.5)):
-        after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + 0.05 * THROUGH))
+    """Until the drone has passed the last gate, in the step after which nothing is charged."""
+    hurried, last = make("gates", time_penalty=0.5), len(GATES) - 1
+    into = OPENING / 2 + FRAME / 2
+    for aside, index, penalty in ((0.0, 0, 0.5), (0.0, last, 0.5), (0.0, last + 1, 0), (into, 0, 0.5 + 60 * 0.5)):
+        gate = GATES[min(index, last)]
+        after = moved(in_gate(aside * LEFT - THROUGH, gate), in_gate(aside * LEFT + 0.05 * THROUGH, gate), index)
         world = start_of_race().replace(variables=after)
         plain, less = (
             sum(weight * term(env.task, world) for weight, term in env.task.rewards.values())

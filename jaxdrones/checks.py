@@ -237,6 +237,9 @@ def check_params(params: Any, finite: bool = True) -> None:
             leaf = constants[name]
             if is_concrete(leaf) and not (np.asarray(leaf) > bound).all():
                 raise UserError(f"params.{name} is {short_repr(leaf)}; give {words}")
+    health = params.aux.get("rotor_health", 1) if isinstance(params.aux, dict) else 1
+    if is_concrete(health) and not ((np.asarray(health) >= 0) & (np.asarray(health) <= 1)).all():
+        raise UserError(f"params.aux['rotor_health'] is {short_repr(health)}; give numbers from 0 to 1")
 
 
 def check_vehicle(params: Any) -> None:

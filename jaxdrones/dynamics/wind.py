@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, function, number
-from jaxdrones.checks import check_function, check_number, check_shape, depends_on
+from jaxdrones.checks import check_function, check_number, check_shape, depends_on, short_repr, takes
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -42,6 +42,8 @@ def in_wind(field: WindField, effect: Annotated[Effect, function("jaxdrones.drag
         ValueError: an argument of another type; in flight, a field of time without a clock, a wind of another shape, or
             an effect that does not depend on `params.wind`.
     """
+    if takes(field, "params"):
+        raise UserError(f"field is {short_repr(field)}, an effect on a drone; give in_wind(field, effect)")
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_function("field", field, arguments, example="jaxdrones.logarithmic_wind(5.0)")
 

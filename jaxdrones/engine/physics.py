@@ -110,11 +110,16 @@ class Physics:
     neighbors: NeighborGrid | None = None
 
     def __post_init__(self):
-        for name in "effects", "pairs", "team_effects", "models":
-            object.__setattr__(self, name, tuple(getattr(self, name)))
         names = [model.name for model in self.models]
         if len(set(names)) < len(names):
             raise UserError(f"models are named {', '.join(names)}; give each a name of its own")
+        for name in "effects", "pairs", "team_effects", "models":
+            functions = tuple(getattr(self, name))
+            object.__setattr__(self, name, functions)
+            if len({*map(id, functions)}) < len(functions):
+                raise UserError(f"{name} are {describe(functions)}, one of them twice; give each once")
+        if self.neighbors is not None and not self.pairs:
+            raise UserError("neighbors is given without pairs, which it limits to nearby drones; leave it out")
         if not (self.neighbors is None or isinstance(self.neighbors, NeighborGrid)):
             raise UserError(
                 f"neighbors is {self.neighbors!r}; give for example jaxdrones.NeighborGrid(cutoff=3.0), or leave it out"

@@ -116,3 +116,10 @@ def test_mistakes_are_named():
         jd.pwm_rotors(CF2X, STATE, jnp.zeros(4))
     with pytest.raises(ValueError, match=r"params.aux lacks 'rotor_health'; found motors"):
         jd.failing(jd.pwm_rotors)(with_motors(), STATE, jnp.zeros(4))
+    team, step = jd.repeat(with_motors(), 1), jd.make_step(rotors=jd.failing(jd.instant_rotors))
+    for wrong in 1.01, -0.01, jnp.nan:
+        ill = team.replace(aux={"rotor_health": jnp.array([[1.0, 0, wrong, 1]])})
+        with pytest.raises(
+            ValueError, match=r"params.aux\['rotor_health'\] is \[\[1.0, 0.0, .* give numbers from 0 to 1"
+        ):
+            step(ill, jd.State.at_rest([[0.0, 0, 1]]), jnp.zeros((1, 4)))

@@ -122,6 +122,8 @@ def test_mistakes_are_named():
         jd.in_wind(3, jd.drag)
     with pytest.raises(ValueError, match=r"effect: downwash takes .* give a function of \(params, state\)"):
         jd.in_wind(lambda pos: pos, jd.downwash)
+    with pytest.raises(ValueError, match=r"field is .*drag.*, an effect on a drone; give in_wind\(field, effect\)"):
+        jd.in_wind(jd.drag, lambda pos, time: pos)
     with pytest.raises(ValueError, match=r"field: <lambda> takes .* give a function of \(pos, time\)"):
         jd.in_wind(lambda pos, time, more: pos, jd.drag)
     with pytest.raises(ValueError, match=r"state.aux lacks 'clock'; give models=\(jaxdrones.clock\(\),\)"):

@@ -138,10 +138,15 @@ def test_a_team_effect_that_returns_the_wrench_of_one_drone_is_named():
         (dict(models=(jd.drag,)), r"models: .* is not a model; give jaxdrones\.Model\(name, init, rate\)"),
         (dict(models=jd.Model("a", lambda p: 0, lambda p, s, c: 0)), "models is .*give a sequence"),
         (dict(models=(jd.Model("a", lambda p: 0, lambda p, s, c: 0),) * 2), "models are named a, a"),
+        (
+            dict(effects=(jd.drag, jd.ground_effect, jd.drag)),
+            "effects are drag, ground_effect, drag, one of them twice",
+        ),
+        (dict(pairs=(jd.downwash,) * 2), "pairs are downwash, downwash, one of them twice"),
         (dict(team_effects=(jd.downwash,)), r"team_effects: downwash takes .*\(params, state\)"),
     ],
 )
-def test_wrong_models_and_team_effects_are_named(arguments, message):
+def test_wrong_models_and_effects_are_named(arguments, message):
     for build in jd.make_step, jd.make_derivative:
         with pytest.raises(ValueError, match=message):
             build(**arguments)

@@ -96,6 +96,8 @@ def test_cells_have_a_size_and_room(settings, message):
         jd.NeighborGrid(**settings)
 
 
-def test_cells_are_asked_for_by_name():
+def test_cells_are_asked_for_by_name_and_with_pairs():
     with pytest.raises(ValueError, match=r"neighbors is 3\.0"):
         jd.make_step(pairs=(jd.downwash,), neighbors=3.0)
+    with pytest.raises(ValueError, match="neighbors is given without pairs"):
+        jd.make_step(neighbors=jd.NeighborGrid(3.0))

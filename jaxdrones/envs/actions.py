@@ -40,6 +40,8 @@ class Action:
     """Nominal parameters of the team -> action type for this vehicle; `None` if independent of the vehicle."""
     entries: Callable[[Params], tuple[Quantity, ...]] | None = None
     """Nominal parameters of one drone -> description of each entry, for `jaxdrones.explain`."""
+    before_first: Callable[[State], Float[Array, " a"]] | None = None
+    """(state) -> action in effect until the first one, which a delay holds back; `None` for zeros."""
     name: str = ""
     """Name of the action type, set by `jaxdrones.make`."""
 
@@ -156,7 +158,8 @@ def one_d_position(step: float = 0.1) -> Action:
 def destination(max_step: float = 1.0) -> Action:
     """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
-    The setpoint is on the straight line to it, at most `max_step` (m) ahead of the drone.
+    The setpoint is on the straight line to it, at most `max_step` (m) ahead of the drone. With a delay it is the place
+    of the drone until the first one arrives.
     """
 
     def target(params, state, action):
@@ -164,7 +167,9 @@ def destination(max_step: float = 1.0) -> Action:
         distance = jnp.maximum(vector.dot(away, vector.unit(away)), max_step)
         return Setpoint.at(state.pos + away * max_step / distance)
 
-    return _setpoint(3, target, lambda params: quantities("destination", "m", "world"))
+    return _setpoint(
+        3, target, lambda params: quantities("destination", "m", "world"), lambda state: jnp.clip(state.pos, -1, 1)
+    )
 
 
 def pid_gains() -> Action:
@@ -223,7 +228,10 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
 
 
 def _setpoint(
-    size: int, target: Callable[[Params, State, Array], Setpoint], entries: Callable[[Params], Entries]
+    size: int,
+    target: Callable[[Params, State, Array], Setpoint],
+    entries: Callable[[Params], Entries],
+    before_first: Callable[[State], Array] | None = None,
 ) -> Action:
     """Action type that commands a setpoint.
 
@@ -235,9 +243,10 @@ def _setpoint(
             wanted = target(params, state, action)
             return controller.control(controller.gains(), params, memory, state, wanted, dt=dt)
 
-        return Action(
-            size, command, controller.init, lambda params: flown_by(pid if pid.fits(params) else geometric), entries
-        )
+        def fitted(params):
+            return flown_by(pid if pid.fits(params) else geometric)
+
+        return Action(size, command, controller.init, fitted, entries, before_first)
 
     return flown_by(pid)
 

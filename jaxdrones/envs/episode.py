@@ -140,6 +140,9 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
     def of_drone(params, memory, state, action, setpoint):
         return env.action.rpm(params, memory, state, action, setpoint, env.dt)
 
+    if env.action.before_first and env.delay[1]:
+        is_before = (jnp.arange(actions.shape[1])[::-1] > world.step)[None, :, None]
+        actions = jnp.where(is_before, jax.vmap(env.action.before_first)(world.drones)[:, None], actions)
     delay = randomize.delay_of(params) if env.draws_delay else env.delay_steps[1]
     known = randomize.scaling_params(env.randomize, params, env.params)
     delayed, target = randomize.delayed(actions, delay), env.task.target_now(world)

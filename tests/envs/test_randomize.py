@@ -125,6 +125,18 @@ def test_a_delayed_action_reaches_the_rotors_late():
     assert commanded[2] > 1.2 * hover
 
 
+def test_before_the_first_destination_arrives_a_drone_holds_its_place():
+    env = make("hover", drones=2, action="destination", delay=(0.02, 0.025))
+    pos = jnp.array([[0.5, -0.4, 0.8], [-0.3, 0.6, 0.2]])
+    world = env.reset(KEY)[1]
+    world = world.replace(drones=jd.State.at_rest(pos))
+    moved = []
+    for _ in range(4):
+        world = env.step(KEY, world, jnp.full((2, 3), -1.0))[1]
+        moved.append(float(jnp.max(jnp.abs(world.drones.pos - pos))))
+    assert max(moved[:2]) < 1e-12 < 1e-4 < moved[3]
+
+
 @pytest.mark.slow
 def test_wind_blows_a_drone_with_drag_away():
     env = make("hover", effects=("drag",), randomize=(constant_wind(3.0),), tilt=0.0, speed=0.0, omega=0.0)

@@ -69,11 +69,13 @@ def add(commands) -> None:
 def _run(options: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
     if options.build:
-        with contextlib.suppress(UserError):  # there is none
-            if options.if_missing:
-                say(f"{betaflight.find_program()} exists")
-                return 0
-        say(f"built {build(say)}")
+        existing = None
+        if options.if_missing:
+            with contextlib.suppress(UserError):  # there is none
+                existing = betaflight.find_program()
+        path = existing or build(say)
+        text = f"{path} exists" if existing else f"built {path}"
+        print_results(options, {"program": str(path), "built": not existing}, text)
         return 0
     if options.if_missing:
         raise UserError("--if-missing is given without --build; give both or none")

@@ -122,6 +122,16 @@ def test_a_build_without_a_compiler_is_refused(capsys, monkeypatch):
     assert "gcc is not installed" in capsys.readouterr().err
 
 
+def test_the_program_that_is_built_or_exists_is_told_as_json_too(capsys, monkeypatch):
+    monkeypatch.setattr("jaxdrones.cli.betaflight.build", lambda say: Path("new"))
+    monkeypatch.setenv("BETAFLIGHT_SITL", sys.executable)
+    for arguments, program, is_built in ([], "new", True), (["--if-missing"], sys.executable, False):
+        assert main(["betaflight", "--build", *arguments, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"program": program, "built": is_built}
+        assert main(["betaflight", "--build", *arguments]) == 0
+        assert capsys.readouterr().out == (f"built {program}\n" if is_built else f"{program} exists\n")
+
+
 def test_a_build_that_fails_says_why(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("jaxdrones.firmware.betaflight.process.PACKAGE", "no such package")

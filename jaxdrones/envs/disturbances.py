@@ -69,29 +69,34 @@ class DisturbanceWithMemory:
         return described(f"start of: {self.text}", functools.partial(self.start))
 
 
-def check_wind(physics: Physics, params: Params, scene: Scene, drawn: Params, disturbance: Disturbance | None) -> None:
-    """Raise for a random wind on which no effect, rotor or model of the physics depends.
+def check_loads(physics: Physics, params: Params, scene: Scene, drawn: Params, disturbance: Disturbance | None) -> None:
+    """Raise for a random wind or force on which no effect, rotor or model of the physics depends.
 
     `params` are those of a team, `scene` may have shapes in place of arrays, and `drawn` is a mask of the parameters
     that are random in every episode.
     """
-
-    def wind(key: jax.Array) -> Array:
-        return disturbance(key, params, 0.01).wind if disturbance else params.wind
-
-    if not (drawn.wind or compiler.depends(wind, jax.random.key(0))):
-        return
     zeros = jnp.zeros_like(params.wind, shape=(len(params.mass), 4))
-    state = physics.init(params, State.at_rest(jnp.zeros_like(params.wind)))
 
-    def loads(wind: Array, scene: Scene) -> Loads:
-        return physics.loads(params.replace(wind=wind), state, zeros, physics.seen(scene))
+    def is_random(field: str) -> bool:
+        def value(key: jax.Array) -> Array:
+            return getattr(disturbance(key, params, 0.01) if disturbance else params, field)
 
-    if not any(jax.tree.leaves(compiler.depends(loads, params.wind, scene))):
-        raise UserError(
-            "there is a random wind, and no effect depends on it; give an effect that does, for example "
-            "effects=('drag',), or leave out the wind"
-        )
+        return getattr(drawn, field) or compiler.depends(value, jax.random.key(0))
+
+    def acts(field: str) -> bool:
+        state = physics.init(params, State.at_rest(jnp.zeros_like(params.wind)))
+
+        def loads(x: Array, scene: Scene) -> Loads:
+            return physics.loads(params.replace(**{field: x}), state, zeros, physics.seen(scene))
+
+        return any(jax.tree.leaves(compiler.depends(loads, getattr(params, field), scene)))
+
+    for field, example in ("wind", "drag"), ("external_force", "external_force"):
+        if is_random(field) and not acts(field):
+            raise UserError(
+                f"there is a random {field}, and no effect depends on it; give an effect that does, for example "
+                f"effects=({example!r},), or leave out the {field}"
+            )
 
 
 @checked

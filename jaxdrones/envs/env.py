@@ -12,10 +12,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.arguments import Fraction, Key, checked
 from jaxdrones.checks import check_shape, check_whole, is_concrete
-from jaxdrones.engine.step import HostStep, Step
+from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
-from jaxdrones.envs.disturbances import Disturbance, DisturbanceWithMemory, check_wind
+from jaxdrones.envs.disturbances import Disturbance, DisturbanceWithMemory, check_loads
 from jaxdrones.envs.episode import in_full_precision
 from jaxdrones.envs.functions import DrawScene, check_episode, check_process, scene_example
 from jaxdrones.envs.observations import PrivilegedObservation, bounds, deviations, observe
@@ -148,7 +148,7 @@ class Env:
         drawn, on_the_way = (self.draws, self.scene), (self.noise, self.disturbance)
         sizes = check_episode(self.task, self.params, *drawn, self.terms, self.dt, first_world, *on_the_way)
         random = jax.tree.unflatten(jax.tree.structure(self.params), self._drawn)
-        check_wind(self.physics.physics, self.params, scene_example(self.scene), random, self.disturbance)
+        check_loads(self.physics.physics, self.params, scene_example(self.scene), random, self.disturbance)
         return sizes
 
     @functools.cached_property
@@ -197,6 +197,7 @@ class Env:
     @in_full_precision
     def begin(self, key: Key, progress: Fraction = 1.0) -> tuple[Float[Array, "n d"], World]:
         """`reset` without images."""
+        assert is_traced(self.params) or self.term_sizes  # checks a replaced field, such as a disturbance
         world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)
         return self.compiled(episode.first_observation)(key, world, rate)

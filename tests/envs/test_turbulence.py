@@ -1,5 +1,6 @@
 """Dryden turbulence: intensities and spectra of the specification at any control rate, and episodes with it."""
 
+import dataclasses
 import itertools
 from functools import lru_cache
 
@@ -12,7 +13,7 @@ from helpers import assert_finite, assert_same_kind, jit_unoptimized, mostly_slo
 import jaxdrones as jd
 from jaxdrones.envs import make
 from jaxdrones.envs.disturbances import random_pushes, scales
-from jaxdrones.envs.randomize import constant_wind, scaled
+from jaxdrones.envs.randomize import constant_wind, scaled, shifted
 from jaxdrones.sensing import Scene, Sphere
 
 KEY = jax.random.key(0)
@@ -161,6 +162,17 @@ WINDS = {
 def test_a_random_wind_without_an_effect_of_it_is_refused(name):
     with pytest.raises(ValueError, match="there is a random wind, and no effect depends on it; give an effect"):
         make("hover", effects=("ground_effect",), **WINDS[name])
+
+
+def test_a_random_force_without_an_effect_of_it_is_refused():
+    """Also one that replaces a field of an environment, in its first reset."""
+    message = "there is a random external_force, and no effect depends on it; give an effect"
+    with pytest.raises(ValueError, match=message):
+        make("hover", randomize=(shifted("external_force", -0.1, 0.1),))
+    env = dataclasses.replace(make("hover"), disturbance=random_pushes(0.3))
+    with pytest.raises(ValueError, match=message):
+        env.reset(jax.random.key(0))
+    make("hover", disturbance=random_pushes(0.3))
 
 
 def gusty_rotors(params, state, command):

@@ -107,6 +107,37 @@ def test_a_team_whose_drones_end_alone_goes_on_until_its_last_is_cut():
     assert not np.any(after[-1].pipeline_state[0].active) and max(x.metrics["error"] for x in after) < 10
 
 
+class Counting:
+    """An environment whose reward is the number of steps, and which terminates after three where the action is 1."""
+
+    def reset(self, rng):
+        zero = jnp.zeros((), jnp.float32)
+        return brax.base.State((zero, rng), zero, zero, zero, {}, {"time_out": zero})
+
+    def step(self, state, action):
+        count = state.pipeline_state[0] + 1
+        done = (action * count >= 3).astype(jnp.float32)
+        info = state.info | {"time_out": jnp.zeros((), jnp.float32)}
+        place = count, state.pipeline_state[1]
+        return state.replace(pipeline_state=place, obs=count, reward=count, done=done, info=info)
+
+
+def test_steps_and_sums_begin_anew_with_every_episode():
+    wrapped = brax._Training(Counting(), 4)
+    state, seen = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), 2)), []
+    for _ in range(8):
+        state = wrapped.step(state, jnp.array([0.0, 1.0]))
+        info = state.info | state.info["episode_metrics"]
+        seen.append([info["steps"], state.done, info["truncation"], info["sum_reward"], info["length"], state.obs])
+    steps, done, truncation, sums, length, obs = np.array(seen).transpose(1, 2, 0)
+    np.testing.assert_array_equal(steps, [[1, 2, 3, 4] * 2, [1, 2, 3, 1, 2, 3, 1, 2]])
+    np.testing.assert_array_equal(length, steps)
+    np.testing.assert_array_equal(done, steps == [[4], [3]])
+    np.testing.assert_array_equal(truncation, done * [[1], [0]])
+    np.testing.assert_array_equal(sums, steps * (steps + 1) / 2)
+    np.testing.assert_array_equal(obs, np.where(done, 0, steps))
+
+
 @pytest.mark.slow
 def test_every_episode_starts_anew(env_of):
     env = brax.wrap(env_of("hover"))

@@ -228,6 +228,19 @@ def test_the_next_episode_begins_in_the_step_after_the_end(vector_of):
     assert not first[3].any() and first[-1]["_reward_position"].all() and not np.array_equal(first[0], starts)
 
 
+def test_a_world_that_a_mask_resets_is_not_reset_again_by_the_next_step(env_of):
+    """In next-step mode; the other one, whose episode ended too, is."""
+    envs = VectorEnv(env_of("hover", duration=0.02), 2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    envs.reset(seed=0)
+    envs.step(np.zeros((2, 4)))
+    assert envs.step(np.zeros((2, 4)))[3].all()
+    start, _ = envs.reset(options={"reset_mask": np.array([True, False])})
+    obs, reward, terminated, truncated, infos = envs.step(np.zeros((2, 4)))
+    assert (reward != 0).tolist() == infos["_reward_position"].tolist() == [True, False]
+    assert not terminated.any() and not truncated.any()
+    assert np.abs(obs[0] - start[0]).max() < 0.2 < np.abs(obs[1] - start[1]).max()
+
+
 @pytest.mark.slow
 def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of):
     envs = vector_of(AutoresetMode.DISABLED)

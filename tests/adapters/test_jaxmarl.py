@@ -57,6 +57,17 @@ def test_the_world_state_of_an_agent_starts_with_its_own_observation(env_of):
     )
 
 
+def test_an_agent_is_done_from_its_own_end_on(env_of):
+    """Though the episode of the team goes on."""
+    env, no = env_of("leader-follower"), jnp.zeros(2, bool)
+    info = dict(rewards={}, metrics={}, terminated=no, truncated=no, active=jnp.array([True, False]))
+    dones = jaxmarl.wrap(env)._outcome(jnp.zeros((2, env.observation_size)), None, jnp.zeros(2), no[0], no[0], info)[3]
+    assert jax.tree.map(bool, dones) == {"drone_0": False, "drone_1": True, "__all__": False}
+    info |= dict(terminated=jnp.array([True, False]), active=jnp.ones(2, bool))
+    dones = jaxmarl.wrap(env)._outcome(jnp.zeros((2, env.observation_size)), None, jnp.zeros(2), no[0], no[0], info)[3]
+    assert jax.tree.map(bool, dones) == {"drone_0": True, "drone_1": False, "__all__": False}
+
+
 @pytest.mark.slow
 def test_the_next_episode_may_start_at_a_given_state(env_of):
     env = jaxmarl.wrap(env_of("hover", drones=2, duration=0.02))

@@ -1,6 +1,7 @@
 """A drone's episode may end before that of its team: it leaves the world, and what remains is that of the others."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -66,10 +67,15 @@ class Fixed(PyTreeNode):
         return jnp.broadcast_to(self.action[:, None], (*self.action.shape, 4))
 
 
+@functools.lru_cache(maxsize=1)
+def _programs(env):
+    return jit_unoptimized(env.reset), jit_unoptimized(env.step)
+
+
 def flown(env, action, steps=STEPS):
     """Worlds and answers of an episode, the drones' actions being constant."""
-    step = jit_unoptimized(env.step)
-    _, world = jit_unoptimized(env.reset)(KEY)
+    reset, step = _programs(env)
+    _, world = reset(KEY)
     answers = []
     for _ in range(steps):
         _, world, *answer = step(KEY, world, Fixed(jnp.asarray(action, float))(None))
@@ -78,7 +84,8 @@ def flown(env, action, steps=STEPS):
 
 
 def test_the_others_fly_on_and_the_team_ends_with_the_last():
-    answers = flown(column(), [-1.0, 0.0])
+    env = column()
+    answers = flown(env, [-1.0, 0.0])
     worlds, rewards, terminated, truncated, infos = zip(*answers, strict=True)
     ended = np.array([info["terminated"] for info in infos])
     last = int(np.argmax(ended[:, 0]))
@@ -88,7 +95,7 @@ def test_the_others_fly_on_and_the_team_ends_with_the_last():
     np.testing.assert_array_equal([world.active for world in worlds], [[k < last, True] for k in range(STEPS)])
     assert not any(terminated) and [bool(x) for x in truncated] == [False] * (STEPS - 1) + [True]
     assert not infos[-1]["truncated"][0] and infos[-1]["truncated"][1]
-    both = flown(column(), [-1.0, -1.0])
+    both = flown(env, [-1.0, -1.0])
     ends = [bool(answer[2]) for answer in both]
     assert not any(answer[3] for answer in both[:-1])
     assert ends.index(True) == max(int(np.argmax([x[4]["terminated"][i] for x in both])) for i in range(2))
@@ -110,11 +117,11 @@ def test_rewards_and_metrics_of_a_step_are_those_of_the_same_drones():
         np.testing.assert_array_equal(info["rewards"]["present"], info["active"])
 
 
-@pytest.mark.slow
 def test_a_team_whose_last_drone_is_cut_is_cut_and_not_terminated():
     """A learner goes on from the value there; so it does where the others had ended before."""
+    env = column()
     for actions, cut in ([1.0, 1.0], True), ([-1.0, 1.0], True), ([-1.0, -1.0], False):
-        answers = flown(column(), actions)
+        answers = flown(env, actions)
         last = next(k for k, answer in enumerate(answers) if answer[2] or answer[3])
         assert last < STEPS - 1 and not np.any(answers[last][0].active)
         assert [bool(x) for x in answers[last][2:4]] == [not cut, cut]

@@ -11,7 +11,9 @@ import pytest
 import jaxdrones as jd
 from jaxdrones.envs import TASKS, AutoReset, check_env, make
 from jaxdrones.envs.episode import RESET
+from jaxdrones.envs.vision import Vision
 from jaxdrones.sensing import Box, Scene, Sphere
+from jaxdrones.tasks.task import World
 
 KEY = jax.random.key(4)
 CAMERA = jd.Camera(resolution=(8, 6), far=20.0)
@@ -37,6 +39,22 @@ def sees(backend="explicit", vision=("depth",), task=TASK, **camera):
 def env():
     """10 images per second of 0.03 s age at 100 control steps per second."""
     return sees(rate=100 / 3, latency=0.04)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_an_image_is_of_the_pose_some_control_steps_ago(delay):
+    """Of the start until then."""
+
+    def render(params, drones, scene):
+        return jd.sensing.Images(None, drones.pos[:, 2], None)
+
+    vision = Vision(("depth",), CAMERA, render, False, 1.0, delay)
+    at = [jd.State.at_rest([[0.0, 0, z]]) for z in range(6)]
+    world = World(None, at[0], None, None, None, jnp.asarray(0), jnp.ones(1, bool), 0.01)
+    world = vision.first(None, world)
+    for k in range(1, 6):
+        world = vision.next(None, world.replace(drones=at[k], step=jnp.asarray(k)))
+        assert world.images["depth"].tolist() == [max(0, k - delay)]
 
 
 def episode(env, key, tape):

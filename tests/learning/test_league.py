@@ -70,6 +70,19 @@ def test_only_the_first_drone_learns_and_the_oldest_past_policy_is_replaced():
     assert_close(league.train(KEY, other, CONFIG).policy.params, result.policy.params, 1e-12)
 
 
+def test_every_snapshot_takes_the_place_of_the_oldest_past_policy(monkeypatch):
+    """With two places and a snapshot after every other update."""
+    monkeypatch.setattr(
+        bptt, "gradient_step", lambda env, config, x, **_: (x.replace(step=x.step + 1, policy=x.policy + 1.0), {})
+    )
+    state = league.TrainState(jnp.asarray(0), KEY, jnp.zeros(1), None, None, past=jnp.zeros((2, 1)))
+    kept = []
+    for _ in range(7):
+        state = league.update(None, CONFIG, state)[0]
+        kept.append(state.past[:, 0].tolist())
+    assert kept == [[0, 0]] + [[0, 2]] * 2 + [[4, 2]] * 2 + [[4, 6]] * 2
+
+
 def test_worlds_that_past_policies_cannot_share_are_a_mistake():
     with pytest.raises(ValueError, match="worlds is 5; give a multiple of past_policies, 2"):
         league.Config(**SMALL | {"worlds": 5}, past_policies=2)

@@ -11,7 +11,7 @@ from helpers import jit_unoptimized
 from jax.flatten_util import ravel_pytree
 
 import jaxdrones as jd
-from jaxdrones.learning import ppo, sharding
+from jaxdrones.learning import batch, ppo, sharding
 
 
 @pytest.mark.parametrize("advantage", [1.0, -1.0])
@@ -73,3 +73,22 @@ def test_a_step_that_counts_has_the_same_weight_on_every_device(monkeypatch):
     shares = jax.vmap(lambda batch: ppo.loss(config, policy, log_std, None, batch), axis_name="devices")(batch)
     for mean, one in zip(jax.tree.leaves(shares), jax.tree.leaves(expected), strict=True):
         assert jnp.mean(mean) == pytest.approx(one.item(), rel=1e-5)
+
+
+def test_a_step_is_followed_by_the_next_one_or_by_what_was_seen_last(monkeypatch):
+    """The value after a step is that before the next one, and at a cut or in the end that of the last observation."""
+    monkeypatch.setattr(batch, "critic_observation", lambda policy, obs, *_: obs)
+    monkeypatch.setattr(batch, "discounted_value", lambda config, critic, obs: obs[..., 0])
+    obs = jnp.arange(8.0).reshape(4, 2, 1, 1)
+    terminated, truncated = (jnp.array(x)[..., None] for x in ([[0, 0], [1, 0], [0, 0], [0, 0]], [[0, 1], [0, 0]] * 2))
+    flight = SimpleNamespace(
+        **dict(obs=obs, final_obs=100 + obs, action=obs, extras=obs, reward=jnp.ones((4, 2, 1)), hidden_state=obs),
+        **dict(terminated=terminated == 1, truncated=truncated == 1, was_done=jnp.zeros((4, 2, 1), bool)),
+        **dict(done=jnp.array([[0, 1], [1, 0], [0, 1], [0, 1]]) == 1, privileged=None, final_privileged=None),
+    )
+    policy = SimpleNamespace(act=lambda hidden, obs: (hidden, obs), obs_stats=SimpleNamespace(normalize=lambda x: x))
+    state = SimpleNamespace(policy=policy, critic=None, log_std=jnp.zeros(1))
+    found = batch.batch_of(ppo.Config(gae_lambda=0.0, gamma=0.5), state, obs[0], flight, jnp.zeros((3, 2, 1, 1)))
+    following = np.array([[2, 101], [0, 5], [6, 105], [106, 107]])  # 0 after a termination
+    np.testing.assert_allclose(found.value_target[..., 0], 1 + 0.5 * following)
+    np.testing.assert_array_equal(found.starts, [[0, 0], [0, 1], [1, 0], [0, 1]])

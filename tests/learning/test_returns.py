@@ -1,9 +1,12 @@
 import types
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.learning.returns import advantages
+from jaxdrones.learning.collect import Worlds
+from jaxdrones.learning.metrics import mean_return, with_returns
+from jaxdrones.learning.returns import advantages, discounted_rewards
 
 T, W = 12, 5
 
@@ -64,3 +67,29 @@ def test_with_lambda_one_values_cancel_and_the_target_is_the_discounted_return()
     )
     expected = np.sum(reward[:, 0] * 0.9 ** np.arange(T)) + 0.9**T * 3.0
     np.testing.assert_allclose(target[0, 0], expected, rtol=1e-12)
+
+
+def test_rewards_after_the_end_of_an_episode_do_not_count():
+    reward, was_done = np.array([[1.0, 2.0], [4.0, 8.0], [16.0, 32.0]])[..., None], np.zeros((3, 2, 1), bool)
+    was_done[1:, 1] = True
+    found = discounted_rewards(types.SimpleNamespace(reward=reward, was_done=was_done), 0.5)
+    np.testing.assert_array_equal(found[..., 0], [[1, 2], [2, 0], [4, 0]])
+
+
+def test_an_episode_weighs_as_many_as_were_restarted_before_their_ends():
+    """Trajectories of 4 steps: an episode of 4 that ends in the last one began in this one, one of 5 before it."""
+    ends, length = np.array([3, 3, 0, 0, 1, -1]), np.array([4, 5, 1, 6, 2, 0])
+    t = np.arange(4)[:, None]
+    done = t == ends[None]
+    trajectory = types.SimpleNamespace(
+        done=done,
+        was_done=((t > ends[None]) & (ends >= 0))[..., None],
+        length=np.where(done, length, 100),
+        episode_return=np.where(done, np.arange(6.0), 50.0)[..., None] * np.ones(2),
+        reward=np.zeros((4, 6, 2)),
+    )
+    before = Worlds(None, None, None, last_return=jnp.full(6, 7.0), last_weight=jnp.full(6, 3.0))
+    after = with_returns(before, trajectory, 0.2)
+    np.testing.assert_allclose(after.last_weight, [1, 1 / 0.8, 1, 1 / 0.8**2, 1, 3])
+    np.testing.assert_array_equal(after.last_return, [0, 1, 2, 3, 4, 7])
+    np.testing.assert_allclose(mean_return(after), np.average(after.last_return, weights=after.last_weight))

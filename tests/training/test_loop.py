@@ -129,6 +129,22 @@ def test_a_training_stops_after_three_evaluations_in_a_row_that_reach_its_rate(r
     assert run.recipe().stop_at == rate and trainer.recipe.config.updates == 6
 
 
+def test_a_resumed_training_keeps_the_highest_success_to_which_the_best_policy_is_tied(trainer, tmp_path, monkeypatch):
+    """Of 8 episodes 7 successes are tied with 8, and 6 with 7 but not with 8."""
+    scores, evaluate = iter([(1.0, 1.0), (0.875, 2.0), (0.75, 3.0)]), trainer.evaluate
+
+    def scripted(policy, key):
+        success, mean_return = next(scores, (0.0, 0.0))
+        return evaluate(policy, key).replace(success=success, mean_return=mean_return)
+
+    monkeypatch.setattr(trainer, "evaluate", scripted)
+    run = Run(tmp_path)
+    with pytest.raises(Killed):
+        loop.train(trainer, run, 3, killed_at(2))  # after the evaluation of update 1
+    loop.train(trainer, run, 3, lambda *_: None)
+    assert run.report()["best_update"] == 1
+
+
 def test_evaluations_that_reached_another_rate_do_not_count(trainer, tmp_path, monkeypatch):
     """A training that stopped at a low rate and is continued with a higher one needs three evaluations at that one."""
     evaluate = trainer.evaluate

@@ -52,6 +52,14 @@ def test_rotors_that_take_their_speed_at_once_have_no_rate_on_either_backend():
             assert_close((rate.vel, rate.omega), (explicit.vel, explicit.omega), 1e-9)
 
 
+def test_the_rate_of_a_quaternion_does_not_jump_with_its_sign(step):
+    """A quaternion and its negative are one attitude, and Bullet returns either."""
+    quat = jnp.array([[0.6, 0.0, 0.0, 0.8], [0.0, 0.8, 0.0, -0.6]])
+    rates = [step.rate(TEAM, HIGH.replace(quat=q, omega=jnp.ones((2, 3))), HOVER).quat for q in (quat, -quat)]
+    np.testing.assert_allclose(rates[0], -rates[1], atol=1e-9)
+    assert np.abs(rates[0]).max() < 1
+
+
 def test_the_rate_of_a_drone_at_rest_on_the_ground_is_zero(step):
     """Gravity and the ground's push together, which the sum of wrenches does not know."""
     state, still = jd.State.at_rest([[0.0, 0, 0.05], [1, 0, 0.05]]), np.zeros((2, 4))

@@ -73,6 +73,8 @@ class Env:
     """Name of the vehicle."""
     steps: int = 0
     """Number of control steps until an episode is truncated; 0 for the task's duration."""
+    _task_steps: int = dataclasses.field(default=0, repr=False)
+    """`steps` if it follows from the task's duration, and so from that of a task that replaces it."""
 
     def __post_init__(self):
         check_process()
@@ -91,8 +93,10 @@ class Env:
         object.__setattr__(self, "params", params)
         if is_concrete(self.steps):
             check_whole("steps", self.steps, 0)
-        if isinstance(self.steps, int) and not self.steps:
-            object.__setattr__(self, "steps", round(float(self.task.duration) / self.dt) + self.task.extra_steps)
+        if isinstance(self.steps, int) and self.steps in (0, self._task_steps):
+            steps = round(float(self.task.duration) / self.dt) + self.task.extra_steps
+            object.__setattr__(self, "steps", steps)
+            object.__setattr__(self, "_task_steps", steps)
 
     def __reduce__(self):
         import cloudpickle  # tasks and randomizations are closures

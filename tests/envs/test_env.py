@@ -148,6 +148,15 @@ def test_a_replaced_field_acts_on_the_new_environment_alone():
         assert truncated == changed and (info["rewards"].keys() == {"one"}) == changed
 
 
+def test_an_episode_is_as_long_as_the_task_unless_its_steps_are_given():
+    """Also where another task replaces that of an environment."""
+    env = make_env("hover")
+    short = dataclasses.replace(env.task, duration=1.0)
+    assert dataclasses.replace(env, task=short).steps == 100 and env.steps == 500
+    assert dataclasses.replace(dataclasses.replace(env, steps=7), task=short).steps == 7
+    assert dataclasses.replace(dataclasses.replace(env, task=short), noise=None, task=env.task).steps == 500
+
+
 def test_a_control_period_is_that_of_the_physics():
     with pytest.raises(ValueError, match=r"dt is 0.02 s, and a step of the physics takes 0.01 s; .* control_hz=50"):
         dataclasses.replace(make_env("hover"), dt=0.02)

@@ -16,6 +16,7 @@ depth at the edges of obstacles.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
 
@@ -32,6 +33,7 @@ from jaxdrones.dynamics.rigid_body import newton_euler
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.learning.layers import expand
 from jaxdrones.learning.settings import Config
 from jaxdrones.params import Params
@@ -58,7 +60,7 @@ class GradientConfig(Config):
     """Largest gradient of a world at a control step, relative to the median of the worlds of its device with a
     gradient. Longer ones are scaled down, so that a few chaotic worlds do not dominate."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
-    """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
+    """Surrogate step of `gradient="surrogate"`, of one control period; by default a rigid body with instant rotors."""
     image_gradient: Switch = True
     """Whether to differentiate camera images, or treat them as constants."""
 
@@ -163,6 +165,12 @@ class SurrogateStep(Step):
     """
 
     def __init__(self, step: Step, surrogate: Callable[[Params, State, Array], State]):
+        period = surrogate.period if isinstance(surrogate, Step) else None
+        if period and step.period and not math.isclose(period, step.period, rel_tol=1e-6):
+            raise UserError(
+                f"a call of the surrogate takes {period:.4g} s, and one of the physics {step.period:.4g} s; give for "
+                f"example surrogate=jaxdrones.make_step(dt={step.period:.4g})"
+            )
         self.physics, self.period, self._step = step.physics, step.period, step
 
         @jax.custom_vjp

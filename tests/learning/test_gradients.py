@@ -28,6 +28,15 @@ def test_scaling_a_gradient_keeps_the_value():
     np.testing.assert_array_equal(scale_gradient(values, 0.5), values)
 
 
+def test_a_surrogate_takes_as_long_as_the_physics():
+    """By default `make_step` has another period; its derivatives would be of another flight."""
+    config = bptt.Config(gradient="surrogate", surrogate=jd.make_step())
+    with pytest.raises(
+        ValueError, match=r"the surrogate takes 0.004167 s, and one of the physics 0.01 s; give .*=0.01"
+    ):
+        with_gradient(jd.make("hover"), config)
+
+
 @pytest.mark.slow
 def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other():
     fine, coarse = jd.make_step(dt=1 / 500, substeps=5), jd.make_step(dt=1 / 100)

@@ -445,6 +445,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--sweep", "horizon"], "give NAME=VALUE,VALUE"),
         (["train", "hover", "--log", "tensorboard,csv"], "give names of tensorboard, wandb, mlflow"),
         (["train", "hover", "--sweep", "horizon=2,3", "--set", "horizon=2"], "given by --set and by --sweep"),
+        (["train", "hover", "--sweep", "updates=2,4", "--budget", "9s"], "--sweep updates is given beside --budget 9s"),
         (["train", "hover", "--sweep", "horizon=2", "--sweep", "horizon=3"], "--sweep horizon is given twice"),
         (["train", "hover", "--sweep", "gamma=0.9,0.99,0.90"], "--sweep has gamma=0.9 twice"),
         (["train", "hover", "--sweep", "gamma=0.9,2"], "gamma is 2.0; give a number of at least 0 and at most 1"),

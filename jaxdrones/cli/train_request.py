@@ -57,6 +57,8 @@ class Request(argparse.Namespace):
         rows = [parse_sweep(text) for text in self.sweep]
         names = [name for name, _ in rows]
         for name in names:
+            if name == "updates" and self.budget is not None:
+                raise UserError(f"--sweep updates is given beside --budget {self.budget}; give one of them")
             if name in self.settings:
                 raise UserError(f"{name} is given by --set and by --sweep; give one of them")
             if names.count(name) > 1:

@@ -50,6 +50,9 @@ class HostStep(Step):
     Compiled code calls it through a callback; an uncompiled rollout loops over it in Python.
     """
 
+    scene: Scene
+    """Scene of calls without one, of NumPy arrays."""
+
     @abc.abstractmethod
     def camera(self, params: Params, state: State, camera: Camera, scene: Scene | None = None) -> Images:
         """Images of the camera of every drone of a team."""

@@ -148,6 +148,7 @@ class Env:
     @functools.cached_property
     def term_sizes(self) -> list[int]:
         """Length of every observation term of a drone."""
+        episode.check_scene(self)
         first_world = functools.partial(episode.first_world, self)
         drawn, on_the_way = (self.draws, self.scene), (self.noise, self.disturbance)
         sizes = check_episode(self.task, self.params, *drawn, self.terms, self.dt, first_world, *on_the_way)

@@ -7,17 +7,19 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxdrones.checks import short_repr
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import randomize
+from jaxdrones.envs.functions import scene_example
 from jaxdrones.envs.observations import observe
 from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import hold_between, init_sensors, measure_sensors
 from jaxdrones.state import State
-from jaxdrones.tasks.task import World
+from jaxdrones.tasks.task import Task, World
 
 DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
 """Random streams to fold into a key, so that only used draws cost time."""
@@ -46,6 +48,28 @@ def check_period(env: Any) -> None:
         raise UserError(
             f"dt is {env.dt:.4g} s, and a step of the physics takes {period:.4g} s; make another environment, with "
             f"control_hz={1 / env.dt:.4g}"
+        )
+
+
+def has_solid(task: Task, scene: Scene) -> bool:
+    """Whether a scene has obstacles that are solid for the drones of a task."""
+    return scene.has_obstacles and ("obstacles" in task.contact or not task.obstacles_terminate)
+
+
+def check_scene(env: Any) -> None:
+    """Raise for a scene whose obstacles are not those of the physics, as one that replaces that of an environment."""
+    step, scene = env.physics, scene_example(env.scene)
+    if isinstance(step, HostStep):
+        flat: Any = [jax.tree.flatten(x) for x in (scene, step.scene)]
+        (given, structure), (own, own_structure) = flat
+        same = structure == own_structure and all(map(np.array_equal, given, own))
+        known = same or scene is not env.scene  # a random one is an argument of every call
+    else:
+        known = step.physics.takes_scene or not has_solid(env.task, scene)
+    if not known:
+        raise UserError(
+            "the physics of the environment does not have the obstacles of its scene; make another environment, with "
+            "this scene"
         )
 
 

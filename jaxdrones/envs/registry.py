@@ -23,6 +23,7 @@ from jaxdrones.envs.action_checks import check_action, check_command
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
+from jaxdrones.envs.episode import has_solid
 from jaxdrones.envs.functions import DrawScene, check_process, equipped, scene_example
 from jaxdrones.envs.named_tasks import make_task
 from jaxdrones.envs.observations import OBSERVATIONS, reading
@@ -163,8 +164,7 @@ def make(
         touched = {needs_of(function).contact for function in (*effects, *pairs)}
         if "ground" in task.contact and "ground" not in touched:
             physics["effects"] = [*physics["effects"], ground_contact]
-        solid = example.has_obstacles and ("obstacles" in task.contact or not task.obstacles_terminate)
-        if solid and not Physics(physics["effects"]).takes_scene:
+        if has_solid(task, example) and not Physics(physics["effects"]).takes_scene:
             physics["effects"] = [*physics["effects"], obstacle_contact]
         if "drones" in task.contact and "drones" not in touched:
             physics["pairs"] = [*pairs, drone_contact]

@@ -41,6 +41,14 @@ def test_obstacles_are_solid_unless_the_task_ends_where_they_are_touched():
     assert not make("hover", scene=BALL, effects=(repelled,)).physics.physics.contacts("obstacles")
 
 
+@pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
+def test_a_scene_whose_obstacles_the_physics_does_not_have_replaces_no_other(backend):
+    with make("hover", backend=backend) as env:
+        dataclasses.replace(env, scene=Scene()).reset(KEY)
+        with pytest.raises(ValueError, match="does not have the obstacles of its scene; make another environment"):
+            dataclasses.replace(env, scene=BALL).reset(KEY)
+
+
 @pytest.mark.parametrize("scene", [3, lambda key: 3])
 def test_what_is_no_scene_is_refused(scene):
     with pytest.raises(ValueError, match=r"scene .* 3; (give|return) a"):

@@ -38,7 +38,7 @@ class BulletStep(HostStep):
     integrator = "Bullet"
 
     def __init__(self, client: Client, physics: Physics, substeps: int, dt: float, scene: Scene):
-        self.client, self.physics, self.substeps, self.dt, self._scene = client, physics, substeps, dt, scene
+        self.client, self.physics, self.substeps, self.dt, self.scene = client, physics, substeps, dt, scene
         self.period = dt * substeps
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
@@ -150,13 +150,13 @@ class BulletStep(HostStep):
     def _given(self, scene: Scene | None) -> Scene:
         self.client.check_open()
         if scene is None:
-            return self._scene
+            return self.scene
         check_scene("scene", scene, files=True)
         return scene
 
     def _set_scene(self, scene: Scene) -> Scene:
         """Place the bodies of a concrete scene; return the part of it that wrenches depend on."""
-        self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
+        self.client.set_scene(scene if scene is self.scene else jax.device_get(scene))
         return self.physics.seen(scene)
 
     def _place(self, params: Params, state: State) -> np.ndarray:
@@ -222,13 +222,13 @@ class BulletStep(HostStep):
 
     def _handed(self, scene: Scene) -> Scene | None:
         """Scene as an argument of the callback; `None` for that of `make_step`."""
-        return None if scene is self._scene else scene
+        return None if scene is self.scene else scene
 
     def _sync_world(self, bodies: jax.Array, scene: Scene | None) -> None:
         """Set bodies and scene of a callback, and invalidate the cached team of concrete calls."""
         self.client.check_open()
         self._params = None
-        self.client.set_scene(self._scene if scene is None else jax.tree.map(np.asarray, scene))
+        self.client.set_scene(self.scene if scene is None else jax.tree.map(np.asarray, scene))
         self.client.set_team(np.asarray(bodies, float))
 
 

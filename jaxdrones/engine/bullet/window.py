@@ -21,7 +21,7 @@ class Window(HostStep):
     def __init__(self, step: BulletStep, params: Params, control_dt: float):
         self._step, self._dt, self._count = step, control_dt, 0
         self.physics, self.dt, self.substeps, self.integrator = step.physics, step.dt, step.substeps, step.integrator
-        self.period = step.period
+        self.period, self.scene = step.period, step.scene
         p, client = step.client.p, step.client.id
         rpm_max, hover = float(params.max_rpm[0]), float(params.hover_rpm[0])
         rpm_max = rpm_max if np.isfinite(rpm_max) else 2 * hover

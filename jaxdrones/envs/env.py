@@ -52,7 +52,7 @@ class Env:
     dt: float
     """Control period, s."""
     action: Action
-    """Action type, fitted to the vehicle."""
+    """Action type, fitted to the nominal parameters unless they are traced."""
     terms: tuple[ObservationTerm, ...]
     """Observation terms to concatenate."""
     randomize: tuple[Randomization, ...] = ()
@@ -91,6 +91,8 @@ class Env:
         if self.draws_delay:
             params = randomize.with_delay(params, sum(self.delay_steps) / 2)
         object.__setattr__(self, "params", params)
+        if not is_traced(params):
+            object.__setattr__(self, "action", self.action.fitted(params))
         if is_concrete(self.steps):
             check_whole("steps", self.steps, 0)
         if isinstance(self.steps, int) and self.steps in (0, self._task_steps):

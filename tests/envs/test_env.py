@@ -148,6 +148,14 @@ def test_a_replaced_field_acts_on_the_new_environment_alone():
         assert truncated == changed and (info["rewards"].keys() == {"one"}) == changed
 
 
+def test_an_action_type_is_fitted_to_the_vehicle_of_its_environment():
+    """Also where one of the two is replaced: the PID has the gains of the Crazyflie, not of a vehicle of 0.5 kg."""
+    small, large = make_env("hover", action="position"), make_env("hover", action="position", vehicle="hb")
+    assert small.action.init is not large.action.init
+    other = dataclasses.replace(make_env("hover", vehicle="hb"), action=ACTIONS["position"]())
+    assert other.action.init is dataclasses.replace(small, params=large.params).action.init is large.action.init
+
+
 def test_an_episode_is_as_long_as_the_task_unless_its_steps_are_given():
     """Also where another task replaces that of an environment."""
     env = make_env("hover")

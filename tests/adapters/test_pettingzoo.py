@@ -1,3 +1,6 @@
+from types import SimpleNamespace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +10,7 @@ pytest.importorskip("pettingzoo")
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from jaxdrones.adapters.pettingzoo import parallel_env
+from jaxdrones.adapters.session import TeamEpisodes, _advance
 from jaxdrones.envs import TASKS
 
 pytestmark = pytest.mark.float32
@@ -63,3 +67,25 @@ def test_mistakes_are_named(env_of):
         env.step({"drone_0": np.zeros(4), "drone_1": jnp.full(4, jnp.nan)})
     with pytest.raises(TypeError, match="unexpected keyword argument 'color'"):
         parallel_env("leader-follower", color="red")
+
+
+def test_an_agent_leaves_when_it_is_terminated_or_cut():
+    """While the third one flies on; of an environment that does nothing else."""
+    names, no = ["drone_0", "drone_1", "drone_2"], np.zeros(3, bool)
+    ended = dict(terminated=np.array([False, True, False]), truncated=np.array([True, False, False]))
+    answers = iter([ended, dict(terminated=no, truncated=no)])
+    agents = TeamEpisodes()
+    agents.possible_agents, agents.agents = names, list(names)
+    agents._session = SimpleNamespace(running=True, step=lambda _: (None, np.zeros(3), False, False, next(answers)))
+    agents._layout = SimpleNamespace(
+        gather_present=lambda actions, present: None, arrange=lambda obs: dict.fromkeys(names, 0)
+    )
+    for flying in names, ["drone_2"]:
+        assert agents.agents == flying
+        assert all(list(part) == flying for part in agents._step({})[0])
+
+
+def test_every_step_of_an_episode_has_a_key_of_its_own():
+    env = SimpleNamespace(step=lambda key, world, action: (jax.random.key_data(key).tolist(), world))
+    first, second = (_advance(env, jax.random.key(0), SimpleNamespace(step=k), None)[1][0] for k in range(2))
+    assert first != second

@@ -10,7 +10,7 @@ from helpers import assert_close, jit_unoptimized, make_step
 
 import jaxdrones as jd
 from jaxdrones.dynamics.contact import contact_radius
-from jaxdrones.engine.clearance import FreeBalls
+from jaxdrones.engine.clearance import FreeBalls, NearObstacles
 from jaxdrones.sensing import Box, Scene, Sphere
 
 TEAM = jd.repeat(jd.load_params("cf2x"), 2)
@@ -106,6 +106,20 @@ def test_the_ball_that_holds_a_drone_is_the_smallest_one():
 
     np.testing.assert_array_equal(largest(params, 1.0001), 0)
     assert np.all(largest(params, 0.999) > 0)
+
+
+def test_a_drone_that_leaves_its_ball_within_a_physics_step_is_stopped():
+    """At a plate half a meter below, through which it would fly 0.8 m in a single step."""
+    plate = Scene.of(Box(pos=(0.0, 0.0, 0.0), size=(2.0, 2.0, 0.02)), ground=False)
+    state = jd.State.at_rest([[0.0, 0, 0.5], [0, 0, 50.0]])
+
+    @jit_unoptimized
+    def after(state):
+        near = NearObstacles([jd.obstacle_contact], state, plate)
+        return near.step(TEAM, state, lambda contact: state.replace(pos=state.pos - jnp.array([[0, 0, 0.8]]))).pos[:, 2]
+
+    stopped, free = after(state)
+    assert 0 < stopped < 0.05 and free == 49.2
 
 
 def height(effect, vel, shift, state):

@@ -1,6 +1,7 @@
 """Episodes that follow one another."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ import pytest
 from helpers import assert_close
 
 from jaxdrones.envs import AutoReset, make
+from jaxdrones.envs.autoreset import Episode
+from jaxdrones.envs.randomize import scaled
 
 env = make("hover", duration=0.05)
 auto = AutoReset(env)
@@ -37,6 +40,24 @@ def test_after_an_end_a_fresh_episode_is_seen_and_the_last_observation_is_kept()
     expected, _, *_ = env.step(KEYS[1 + end], before.world, jnp.zeros((1, 4)))
     np.testing.assert_array_equal(info["final_obs"], expected)
     assert episode.world.step == 0 and not np.allclose(obs, expected)
+
+
+def test_parameters_are_constant_unless_something_changes_them():
+    """A disturbance without memory does, too, though nothing is drawn at a start."""
+    pushed = make("hover", disturbance=lambda key, params, dt: params.replace(external_force=params.external_force + 1))
+    drawn = make("hover", randomize=(scaled("mass", 0.9, 1.1),))
+    assert [e.constant_fields for e in (env, pushed, drawn)] == [("params", "scene"), ("scene",), ("scene",)]
+
+
+def test_the_return_of_a_drone_has_the_reward_of_its_last_step():
+    """After which it is not in the world."""
+    world = SimpleNamespace(active=jnp.array([False, True]))
+    no = jnp.zeros((), bool)
+    step = lambda key, world, action: (None, world, jnp.array([3.0, 5.0]), no, no, {})  # noqa: E731
+    before = Episode(world, jnp.array([10.0, 20.0]), jnp.asarray(4))
+    after, *_, info = AutoReset(SimpleNamespace(step=step)).step_without_reset(KEYS[0], before, jnp.zeros((2, 4)))[1:]
+    assert after.episode_return.tolist() == info["episode"]["return"].tolist() == [13, 25]
+    assert after.length == info["episode"]["length"] == 5
 
 
 def test_every_episode_starts_elsewhere():

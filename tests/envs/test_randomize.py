@@ -105,6 +105,21 @@ def test_every_episode_draws_a_delay_of_its_own_and_flies_with_it():
     assert not np.any(delay[:, 0] == delay[:, 1])
 
 
+def test_a_privileged_observation_has_the_parameters_of_the_episode():
+    """The drawn ones, as deviations from the nominal vehicle."""
+    env = make("hover", drones=2, randomize=(scaled("mass", 0.8, 1.2), scaled("kf", 0.9, 1.1)))
+
+    @jit_unoptimized
+    def drawn(key):
+        world = env.reset(key)[1]
+        return world.params.mass, world.params.kf, env.privileged_observation(world).params
+
+    mass, kf, found = drawn(KEY)
+    ratio = np.stack([mass / env.params.mass, kf / env.params.kf], axis=1)
+    np.testing.assert_allclose(np.sort(found), np.sort(ratio - 1), rtol=1e-9)
+    assert env.privileged_size == 2 and len(np.unique(found)) == 4
+
+
 def test_bounds_of_a_delay_are_checked():
     for delay in (0.02, 0.01), (0.0, 5.0), (-0.01, 0.01), (0.01,), (0.0, np.nan):
         with pytest.raises(ValueError, match="delay"):

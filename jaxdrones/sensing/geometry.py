@@ -21,8 +21,12 @@ def length(v: Float[Array, " n"]) -> Number:
 
 
 def signed_distance(beyond: Float[Array, " n"]) -> Number:
-    """Signed distance from a product of intervals, given the excess of each coordinate beyond its interval."""
-    return length(jnp.maximum(beyond, 0)) + jnp.minimum(jnp.max(beyond), 0)
+    """Signed distance from a product of intervals, given the excess of each coordinate beyond its interval.
+
+    Its gradient on a face is that of inside.
+    """
+    inside = jnp.max(beyond)
+    return length(jnp.maximum(beyond, 0)) + jnp.where(inside > 0, 0, inside)
 
 
 def outward(beyond: Float[Array, " n"]) -> Float[Array, " n"]:

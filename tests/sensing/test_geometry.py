@@ -94,6 +94,15 @@ def test_the_nearest_point_of_the_surface_is_a_distance_down_the_gradient(solid)
     np.testing.assert_allclose(distances(scene, points - found[:, None] * slopes), 0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("solid", "point"), [(BRICK, (1.0, 0.5, 0.1)), (POLE, (0.1, 0.0, 1.0)), (POLE, (0.5, 0.0, 0.1))]
+)
+def test_the_gradient_on_a_face_is_the_normal(solid, point):
+    found, slope = jax.value_and_grad(solid.distance)(jnp.array(point))
+    assert found == 0
+    np.testing.assert_allclose(slope, solid.outward(jnp.array(point)), atol=1e-12)
+
+
 surfaces = jit_unoptimized(jax.vmap(Scene.nearest, (None, 0)))
 
 

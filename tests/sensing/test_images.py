@@ -119,6 +119,42 @@ def test_a_leveled_camera_ignores_roll_and_a_fixed_one_turns():
         assert same == leveled
 
 
+def test_a_leveled_camera_looks_ahead_with_the_left_and_the_world_above_where_they_are_in_the_image():
+    params, state = jax.tree.map(lambda x: x[0], team(([0, 0, 1], [0.5, -0.3, 2])))
+    eye, (forward, left, up) = jit_unoptimized(Camera(leveled=True, offset=(0.1, 0, 0.2)).pose)(params, state)
+    np.testing.assert_allclose(forward, rotation.axes(state.quat)[0], atol=1e-12)
+    np.testing.assert_allclose(left, [-np.sin(2), np.cos(2), 0], atol=1e-12)
+    np.testing.assert_allclose(up, np.cross(forward, left), atol=1e-12)
+    np.testing.assert_allclose(eye, [0.1, 0, 1.2], atol=1e-12)
+    assert up[2] > 0.9
+
+
+def test_the_principal_point_is_the_pixel_of_the_viewing_direction_to_the_right_of_and_below_the_center():
+    camera = Camera(resolution=(40, 20), principal_point=(3.5, 1.5))
+    view = view_of(camera, *jax.tree.map(lambda x: x[0], team(([0, 0, 1], [0, 0, 0]))))
+    assert view.u[0, 23] == view.v[11, 0] == 0 and np.all(np.diff(view.u[0]) < 0) and np.all(np.diff(view.v[:, 0]) < 0)
+
+
+@pytest.mark.parametrize("edge", [0.3, 1.1])  # m, of pixels on tiles of 0.5 m
+def test_a_pixel_has_the_mean_of_the_tiles_in_it(edge):
+    """Of the checkered ground far below, by many samples over the edge of a pixel."""
+    down = team(([0.1, 0.2, 100.0], [0, np.pi / 2, 0]))
+    fine, few = 20, 12
+
+    def tiles(pixels, slope):
+        camera = Camera(resolution=(pixels, pixels), field_of_view=2 * np.degrees(np.arctan(slope)))
+        view = view_of(camera, *jax.tree.map(lambda x: x[0], down))
+        height = np.full((view.v + view.u).shape, 100.0)
+        ground = [Ground.of(float)], jnp.zeros((1, 3)), 0, height.astype(int) * 0, height
+        return np.asarray(jit_unoptimized(shade, static_argnums=3)(view, *ground)[..., 0], float)
+
+    slope = few * edge / 2 / 100
+    many = tiles(few * fine, slope).reshape(few, fine, few, fine).mean(axis=(1, 3))
+    np.testing.assert_allclose(
+        tiles(few, slope).reshape(few, few), many, atol=3
+    )  # of about 60 levels between dark and bright
+
+
 @pytest.mark.slow
 def test_an_orientation_turns_the_camera():
     scene = scattered(0)

@@ -60,6 +60,13 @@ def test_each_parameter_is_read_off_its_own_part_of_the_curve():
     np.testing.assert_allclose(curve.max(), 0.3 * np.sqrt(2 * np.log(2) / np.pi), rtol=1e-4)
 
 
+def test_the_noise_that_drives_a_bias_in_a_filter_is_that_of_its_steps():
+    noise, dt = Noise(instability=0.3, correlation=50.0, random_walk=0.02), 0.1
+    errors = noise.init(KEY, (20_000,), float)
+    steps = noise.measure(jax.random.key(1), errors, jnp.zeros(20_000), dt)[0].bias - errors.bias
+    np.testing.assert_allclose(np.std(steps), noise.bias_walk * np.sqrt(dt), rtol=0.03)
+
+
 @pytest.mark.parametrize("part", [BMI088, MPU9250], ids=["BMI088", "MPU9250"])
 @pytest.mark.slow
 def test_a_part_has_the_noise_of_its_data_sheet(part):

@@ -137,6 +137,8 @@ def test_optical_flow_is_the_velocity_over_the_height_and_the_turn():
     omega = np.array([0.3, 0.2, 0.0])
     about_ground = np.cross(omega, [0, 0, 2.0])
     np.testing.assert_allclose(reading(flow, at((0, 0, 2), vel=about_ground, omega=omega), Scene()), 0, atol=1e-12)
+    near = at((0, 0, 0.02), vel=(0.4, 0, 0))  # out of focus: as from 8 cm
+    np.testing.assert_allclose(reading(flow, near, Scene()), [0.4 / 0.08, 0])
     np.testing.assert_allclose(reading(flow, at(vel=(1, 1, 1)), Scene(ground=False)), 0)
 
 

@@ -44,6 +44,15 @@ def test_a_heading_that_was_not_recorded_is_not_taken_for_north():
         closed_loop_columns(log)
 
 
+def test_the_sag_of_a_battery_is_from_its_highest_voltage_at_rest():
+    log = log_of(0.05, TAKE_OFF)
+    vbat = np.array(log.vbat)
+    vbat[: TAKE_OFF // 2] -= 0.3  # it was connected a moment ago
+    assert dataclasses.replace(log, vbat=vbat).sag == pytest.approx(REST - LOADED)
+    vbat[TAKE_OFF : TAKE_OFF + 150] -= 0.3  # the climb
+    assert dataclasses.replace(log, vbat=vbat).sag == pytest.approx(REST - LOADED)
+
+
 @pytest.fixture(scope="module")
 def flown():
     """A vehicle with an unfelt sag of 0.5, and its simulations from a start in flight and from one on the ground."""

@@ -10,7 +10,7 @@ from jaxdrones.flights import read_log, save_npz
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.files import arrays_of
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.flights.results import definitions, diverged, results
+from jaxdrones.flights.results import definitions, diverged, divergence, results
 from jaxdrones.params import repeat
 from jaxdrones.urdf import load_params
 
@@ -94,6 +94,27 @@ def test_a_flight_by_another_clock_has_the_same_results(begin):
         assert found == pytest.approx(expected, rel=0.01)
     assert late.begin == late.t[0] and record.begin == 0
     assert "all other numbers count from 1001.0" in definitions(dataclasses.replace(record, t=record.t + 1e3), 1.005)
+
+
+@pytest.mark.parametrize(("last", "settled"), [(150, 1.5), (1, 0.01), (0, 0.0), (310, None)])
+def test_a_drone_has_settled_where_its_error_stays_in_the_band_for_the_first_time(last, settled):
+    """Its error leaves the band in row `last` - 1 for the last time; the last quarter begins in row 299."""
+    record = hovering(steps=400)
+    for rows in slice(0, max(last - 20, 0)), slice(max(last - 1, 0), last):
+        record = changed(record, "pos", rows, [1.0, 0, 1])
+    found = results(record, 0.0)[1]["settled_after_s"]
+    assert found == (None if settled is None else pytest.approx(settled + 0.01 * (last > 0)))
+
+
+def test_flights_differ_by_the_largest_distances_and_angles_over_the_drones():
+    """The second drone is 5 m off, and turned by 0.3 rad; the sign of a quaternion has no meaning."""
+    record, turned = hovering(), [0, 0, -np.sin(0.15), -np.cos(0.15)]
+    other = changed(changed(record, "quat", slice(None), turned), "pos", slice(None), [0.1 + 3, 4, 1])
+    table = divergence(record, other)
+    assert [row["t_s"] for row in table] == sorted({row["t_s"] for row in table}) and len(table) == 12
+    for row in table:
+        assert row["pos_m"] == pytest.approx(5) and row["angle_rad"] == pytest.approx(0.3)
+        assert row["vel_m_s"] == row["omega_rad_s"] == row["rpm"] == 0
 
 
 def test_pwm_is_of_a_crazyflie():

@@ -109,6 +109,20 @@ def test_a_damaged_bag_is_refused(tmp_path):
     assert refused >= 7
 
 
+def test_the_velocity_in_a_bag_is_that_of_the_body(tmp_path):
+    """Of a drone that has turned left by a quarter, and then flies ahead and climbs."""
+    pose = msg.Pose(msg.Point(1.0, 2.0, 3.0), msg.Quaternion(0.0, 0.0, 0.5**0.5, 0.5**0.5))
+    twist = msg.Twist(msg.Vector3(2.0, 0.0, 0.5), msg.Vector3(0.1, 0.2, 0.3))
+    state = msg.Odometry(pose=msg.PoseWithCovariance(pose), twist=msg.TwistWithCovariance(twist))
+    with bag.Recorder(tmp_path / "bag") as recorder:
+        recorder.write(topics.output(0, "odom"), state, 5)
+        recorder.write(topics.output(0, "motors"), msg.Float64MultiArray(data=(1.0,) * 4), 5)
+    log = read_log(tmp_path / "bag")
+    np.testing.assert_allclose(log.vel, [[[0, 2, 0.5]]], atol=1e-12)
+    np.testing.assert_array_equal(log.omega, [[[0.1, 0.2, 0.3]]])
+    np.testing.assert_array_equal(log.pos, [[[1, 2, 3]]])
+
+
 def test_a_bag_without_a_flight_is_refused(tmp_path):
     with bag.Recorder(tmp_path / "bag") as recorder:
         recorder.write(topics.CLOCK, msg.Clock(convert.stamp(5)), 5)

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 import jaxdrones
+from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import FlightLog, Vehicle, simulate_closed_loop
 from jaxdrones.flights.closed_loop import closed_loop_columns
 from jaxdrones.flights.preparation import prepare
+from jaxdrones.flights.vehicle import Instruments
+from jaxdrones.state import State
 
 ROWS, REST, LOADED = 700, 4.1, 3.3
 HEIGHT = 0.5  # m, of the set-point
@@ -51,6 +54,19 @@ def test_the_sag_of_a_battery_is_from_its_highest_voltage_at_rest():
     assert dataclasses.replace(log, vbat=vbat).sag == pytest.approx(REST - LOADED)
     vbat[TAKE_OFF : TAKE_OFF + 150] -= 0.3  # the climb
     assert dataclasses.replace(log, vbat=vbat).sag == pytest.approx(REST - LOADED)
+
+
+def test_the_onboard_estimate_is_late_and_exaggerates_the_tilt():
+    """Of a drone that turns steadily at a constant velocity: its state 20 ms ago, with 1.5 times the tilt."""
+    quat, omega = rotation.from_rpy(jnp.array([0.02, -0.03, 0.8])), jnp.array([0.3, -0.5, 2.0])
+    state = State(jnp.array([1.0, 2, 3]), quat, jnp.array([0.5, -1, 2]), omega, jnp.zeros(4))
+    ago = rotation.multiply(quat, rotation.exp(-0.02 * omega))
+    late = Instruments.ideal().replace(estimate_delay=jnp.array(0.02))
+    np.testing.assert_allclose(late.estimate(state).pos, [0.99, 2.02, 2.96], rtol=1e-12)
+    np.testing.assert_allclose(late.estimate(state).quat, ago, rtol=1e-12)
+    np.testing.assert_array_equal(late.estimate(state).omega, omega)
+    seen = late.replace(estimate_tilt=jnp.array(1.5)).estimate(state).quat
+    np.testing.assert_allclose(rotation.z_axis(seen)[:2], 1.5 * rotation.z_axis(ago)[:2], rtol=2e-3)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from jaxdrones.flights.open_loop import HORIZONS, Windows, predict, residuals
 from jaxdrones.flights.parameters import with_parameters
 from jaxdrones.flights.vehicle import Vehicle
 
-_CAUCHY_SCALE_SQUARED = 1.0  # c^2 of the Cauchy loss c^2 log(1 + s / c^2); s is a window's mean squared residual
+_CAUCHY_SCALE_SQUARED = 1.0  # c^2 of the Cauchy loss n c^2 log(1 + s / c^2); s is the mean of a window's n squares
 _INITIAL_DAMPING = 1e-3  # fraction of the diagonal
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 
@@ -25,9 +25,9 @@ class Normal(NamedTuple):
     matrix: Any
     """(n, n) Gauss-Newton matrix J'WJ."""
     gradient: Any
-    """(n,) J'Wr."""
+    """(n,) J'Wr, half of the gradient of the loss."""
     loss: Any
-    """()"""
+    """() robust sum of squares."""
     scale: Any = np.ones(())
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
 
@@ -82,7 +82,7 @@ def normal_equations(
         square = jnp.mean(r * r)
         weight = mask / (1 + square / _CAUCHY_SCALE_SQUARED)
         flat, r = jacobian.reshape(len(x), -1), r.reshape(-1)
-        return flat, weight, r, mask * _CAUCHY_SCALE_SQUARED * jnp.log1p(square / _CAUCHY_SCALE_SQUARED)
+        return flat, weight, r, mask * len(r) * _CAUCHY_SCALE_SQUARED * jnp.log1p(square / _CAUCHY_SCALE_SQUARED)
 
     jacobian, weight, r, loss = jax.vmap(of_window)(windows, mask)
     matrix = jnp.einsum("pik,pjk,p->ij", jacobian, jacobian, weight)

@@ -2,6 +2,7 @@
 
 import builtins
 import dataclasses
+import functools
 import importlib
 import json
 import re
@@ -18,8 +19,17 @@ from jaxdrones.cli import main
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
-from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
-from jaxdrones.flights.fit import Estimate, Report, _estimate
+from jaxdrones.flights import (
+    FlightLog,
+    Vehicle,
+    fit,
+    hold_errors,
+    least_squares,
+    load_flights,
+    load_vehicle,
+    open_loop_errors,
+)
+from jaxdrones.flights.fit import Estimate, Report, _estimate, _Problem
 from jaxdrones.flights.least_squares import standard_errors
 from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
 from jaxdrones.flights.parameters import check_guess
@@ -102,6 +112,24 @@ def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
     for estimate in fits:
         np.testing.assert_allclose(estimate.value, flown[0].kf, rtol=0.01)
         assert estimate.identifiable
+
+
+def test_the_normal_equations_have_half_of_the_gradient_of_their_loss(monkeypatch):
+    """With outlying windows, of which the loss grows slowly, and away from the initial guess, with its prior."""
+
+    def predict(vehicle, start, command, motors):  # compiles fast
+        x, y, _ = vehicle.params.drag_coeff * 1e7
+        pos = start.pos[None] * (1 + 0.3 * jnp.arange(3.0) * jnp.sin(x + y * y))[:, None]
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *x.shape)), start).replace(pos=pos)
+
+    monkeypatch.setattr(least_squares, "predict", predict)
+    rng, rows = np.random.default_rng(0), 120
+    still, moved = np.tile([0, 0, 0, 1.0], (rows, 1, 1)), 0.1 * rng.normal(size=(3, rows, 1, 3))
+    log = FlightLog(0.01 * np.arange(rows), moved[0], still, *moved[1:], rpm=np.full((rows, 1, 4), 14e3))
+    problem = _Problem([log], jaxdrones.load_params("cf2x"), ("drag_coeff_x", "drag_coeff_y"), crazyflie_motors())
+    normal, x = functools.partial(problem.normal, scales=[np.full((3, 4), 0.1)]), np.array([0.2, -0.3])
+    slopes = [normal(x + d).loss - normal(x - d).loss for d in 1e-5 * np.eye(2)]
+    np.testing.assert_allclose(normal(x).gradient, np.divide(slopes, 4e-5), rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.visualization import browser
@@ -173,6 +174,22 @@ def test_push_mass_and_weight_obey_newton(made):
         acc = after[7:10] / made.dt
         expected = np.array(PUSH) / (share * made.mass) - [0, 0, 9.8]
         np.testing.assert_allclose(acc, expected, rtol=2e-3, atol=2e-3)
+
+
+def test_a_push_is_in_world_axes_and_a_heavy_drone_turns_as_much_slower_as_it_is_heavier():
+    from jaxdrones.export.simulation import _physics
+
+    params, zero, dt = jd.load_params("cf2x"), jnp.zeros(3), 1 / 240
+    step = jit_unoptimized(_physics(params, dt))
+    level = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.array([[0.0, 0, 5]])))
+    tilted = level.replace(quat=jd.rotation.from_rpy(jnp.array([0.5, -0.7, 2.0])))
+    push = jnp.array([0.1, -0.2, 0.3])
+    acc = step(tilted, jnp.zeros(4), zero, params.mass, push).vel / dt + jd.vector.along_z(params.gravity)
+    np.testing.assert_allclose(params.mass * acc, push, rtol=1e-9)
+    rpm = params.hover_rpm * jnp.array([1.1, 1.0, 0.9, 1.05])
+    light, heavy = (step(level, rpm, zero, share * params.mass, zero).omega for share in (1, 3))
+    np.testing.assert_allclose(light, 3 * heavy, rtol=1e-9)
+    assert (jnp.abs(heavy) > 1e-3).all()
 
 
 @pytest.mark.parametrize(

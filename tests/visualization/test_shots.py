@@ -3,12 +3,13 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.sensing import Cylinder, Scene, Sphere, ray, room
+from jaxdrones.sensing import Camera, Cylinder, Scene, Sphere, images, ray, room
 from jaxdrones.visualization.overlay import Lens
-from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, _distance, shoot
 
 SIZE = (1280, 720)
 TRUNKS = np.random.default_rng(0).uniform([0, -6, 2], [20, 6, 2], (30, 3))
@@ -41,6 +42,30 @@ FLIGHTS = {
     "forest": lambda record: along(record, straight, Scene.of(Cylinder(pos=TRUNKS, radius=0.15, height=4.0))),
     "room": lambda record: along(record, around, room()),
 }
+
+
+@pytest.mark.parametrize("direction", [(0.6, -0.5, 0.6), (0.0, 1.0, 0.2)])
+def test_the_distance_of_a_camera_is_the_smallest_with_all_points_in_the_middle_of_the_picture(direction):
+    points, middle = np.random.default_rng(0).normal(size=(50, 3)) * [3, 1, 0.5], np.array([1.0, 2.0, 3.0])
+    direction = np.array(direction) / np.linalg.norm(direction)
+    (away,) = _distance(points[None], 0.0, direction, SIZE[0] / SIZE[1])
+    pixels, depth = Lens(middle + away * direction, middle, FIELD_OF_VIEW, SIZE).project(middle + points)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(np.abs(pixels / SIZE - 0.5).max(), 0.85 / 2, rtol=1e-9)
+
+
+def test_a_lens_projects_what_a_camera_sees_onto_the_same_pixel():
+    """The center of a pixel is half a pixel from its corner."""
+    eye, target = np.array([1.0, -2.0, 3.0]), np.array([4.0, 1.0, 2.0])
+    lens = Lens(eye, target, FIELD_OF_VIEW, (64, 48))
+    axes = np.stack(Lens.axes_of(eye, target))
+    rays = images._view(
+        Camera(resolution=(64, 48), field_of_view=FIELD_OF_VIEW), jnp.asarray(eye), jnp.asarray(axes), 0.1
+    )
+    for row, column, depth in (0, 0, 1.0), (40, 5, 7.0), (11, 60, 3.0):
+        point = eye + depth * np.array([1, rays.u[0, column], rays.v[row, 0]]) @ axes
+        pixel, away = lens.project(point)
+        np.testing.assert_allclose([*pixel, away], [column + 0.5, row + 0.5, depth], rtol=1e-9)
 
 
 @pytest.fixture(scope="module", params=FLIGHTS)

@@ -95,6 +95,7 @@ def test_a_trajectory_of_worlds_is_as_many_worlds(team):
     assert [world["name"] for world in worlds] == ["world 0", "world 1", "world 2"]
     for w, world in enumerate(worlds):
         np.testing.assert_allclose(world["pos"], paths.pos[w], rtol=0, atol=1e-4)
+        np.testing.assert_allclose(world["t"], 0.01 * np.arange(1, 1 + len(paths.pos[w])), rtol=1e-6)  # after steps
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ from jaxdrones.flights.fit import Estimate, Report, _estimate, _Problem
 from jaxdrones.flights.least_squares import standard_errors
 from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
 from jaxdrones.flights.parameters import check_guess
+from jaxdrones.flights.path_fit import _balance_residuals
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
 from jaxdrones.urdf import parse_params
@@ -114,22 +115,52 @@ def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
         assert estimate.identifiable
 
 
-def test_the_normal_equations_have_half_of_the_gradient_of_their_loss(monkeypatch):
-    """With outlying windows, of which the loss grows slowly, and away from the initial guess, with its prior."""
+@pytest.fixture
+def problem_of(monkeypatch):
+    """Least-squares problems of flights by a model that compiles fast: positions depend on two parameters."""
 
-    def predict(vehicle, start, command, motors):  # compiles fast
-        x, y, _ = vehicle.params.drag_coeff * 1e7
-        pos = start.pos[None] * (1 + 0.3 * jnp.arange(3.0) * jnp.sin(x + y * y))[:, None]
+    def predict(vehicle, start, command, motors):
+        x, y = vehicle.params.drag_coeff[0] * 1e7, vehicle.params.trim_torque[0] * 1e4
+        pos = start.pos[None] * (1 + 0.3 * jnp.arange(3.0) * jnp.sin(x + y * y - y))[:, None]
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *x.shape)), start).replace(pos=pos)
 
+    def problem(flights, names):
+        rng, rows = np.random.default_rng(0), 120
+        still, moved = np.tile([0, 0, 0, 1.0], (rows, 1, 1)), 0.1 * rng.normal(size=(3, rows, 1, 3))
+        log = FlightLog(0.01 * np.arange(rows), moved[0], still, *moved[1:], rpm=np.full((rows, 1, 4), 14e3))
+        logs = named_apart([log] * flights)
+        return _Problem(logs, jaxdrones.load_params("cf2x"), names, crazyflie_motors())
+
     monkeypatch.setattr(least_squares, "predict", predict)
-    rng, rows = np.random.default_rng(0), 120
-    still, moved = np.tile([0, 0, 0, 1.0], (rows, 1, 1)), 0.1 * rng.normal(size=(3, rows, 1, 3))
-    log = FlightLog(0.01 * np.arange(rows), moved[0], still, *moved[1:], rpm=np.full((rows, 1, 4), 14e3))
-    problem = _Problem([log], jaxdrones.load_params("cf2x"), ("drag_coeff_x", "drag_coeff_y"), crazyflie_motors())
+    monkeypatch.setattr(
+        importlib.import_module("jaxdrones.flights.fit"), "open_loop_errors", lambda *_: np.ones((3, 4))
+    )
+    return problem
+
+
+def test_the_normal_equations_have_half_of_the_gradient_of_their_loss(problem_of):
+    """With outlying windows, of which the loss grows slowly, and away from the initial guess, with its prior."""
+    problem = problem_of(1, ("drag_coeff_x", "trim_torque_x"))
     normal, x = functools.partial(problem.normal, scales=[np.full((3, 4), 0.1)]), np.array([0.2, -0.3])
     slopes = [normal(x + d).loss - normal(x - d).loss for d in 1e-5 * np.eye(2)]
     np.testing.assert_allclose(normal(x).gradient, np.divide(slopes, 4e-5), rtol=1e-5)
+
+
+def test_the_error_of_a_median_over_flights_falls_with_the_root_of_their_number(problem_of):
+    found = [problem_of(n, ("trim_torque_x",)).solve((), False, lambda _: None) for n in (1, 4)]
+    one, four = (report.parameters["trim_torque_x"] for report in found)
+    assert len(found[1].per_flight) == 4 and four.value == pytest.approx(one.value)
+    assert four.std_error == pytest.approx(one.std_error / 2)
+
+
+def test_a_vehicle_whose_thrust_carries_and_lifts_it_is_in_balance():
+    vehicle, motors = Vehicle.of(jaxdrones.load_params("cf21")), crazyflie_motors()
+    duty, battery, up = jnp.full((1, 100, 4), 0.6), jnp.full((1, 100), 3.9), jnp.full((1, 100), 0.9)
+    lift = 4 * motors.thrust(jnp.array(0.6 * 3.9)) * 0.9
+    acc = lift / vehicle.params.mass - vehicle.params.gravity
+    found = _balance_residuals(vehicle, motors, duty, battery, jnp.zeros((1, 1)), up, acc[None], jnp.zeros(2))
+    np.testing.assert_allclose(found, 0, atol=1e-9)
+    assert abs(acc) > 1
 
 
 @pytest.mark.slow

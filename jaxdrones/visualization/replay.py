@@ -33,6 +33,6 @@ def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequen
             for label, picture in zip(record.labels, rgb, strict=True):
                 (folder / label).mkdir(parents=True, exist_ok=True)
                 imsave(folder / label / f"{frame:05d}.png", picture)
-            t.append(frame / fps)
+            t.append(record.begin + frame / fps)
             pictures.append(np.asarray(rgb))
     return ImageSequence(np.array(t), np.stack(pictures))

@@ -158,8 +158,7 @@ def one_d_position(step: float = 0.1) -> Action:
 def destination(max_step: float = 1.0) -> Action:
     """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
-    The setpoint is on the straight line to it, at most `max_step` (m) ahead of the drone. With a delay it is the place
-    of the drone until the first one arrives.
+    The setpoint is on the line to it, at most `max_step` (m) ahead. A delayed drone keeps its place until the first one.
     """
 
     def target(params, state, action):

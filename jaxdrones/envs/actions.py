@@ -158,7 +158,7 @@ def one_d_position(step: float = 0.1) -> Action:
 def destination(max_step: float = 1.0) -> Action:
     """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
-    The setpoint is on the line to it, at most `max_step` (m) ahead. A delayed drone keeps its place until the first one.
+    The setpoint is on the line to it, at most `max_step` (m) ahead. With a delay, a drone first keeps its place.
     """
 
     def target(params, state, action):

@@ -24,7 +24,7 @@ from jaxdrones.envs.vision import ImageSpace, Vision, observation
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.sensing.sensor import Sensor, check_sensors
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
 RowSet = tuple[int, int, int, float]
@@ -79,6 +79,7 @@ class Env:
     def __post_init__(self):
         check_process()
         episode.check_period(self)
+        check_sensors(self.sensors, self.dt)
         of_team = [model.name for model in self.physics.physics.models if model.of_team]
         if of_team and self.task.ends == "drone":
             raise UserError(

@@ -1,6 +1,7 @@
 """Models, effects on a team, sensors and scenes in an environment, on both backends."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -47,9 +48,11 @@ def battery():
 
 @pytest.mark.parametrize("rate", [101.0, 1000.0])
 def test_a_rate_above_the_control_rate_is_refused(rate):
-    fast = dataclasses.replace(NOISY, rate=rate)
-    with pytest.raises(ValueError, match=rf"'noisy' measures at {rate:g} Hz; give at most the control rate, 100 Hz"):
-        make("hover", sensors=(fast,))
+    """Also of a sensor that replaces those of an environment."""
+    fast, made = dataclasses.replace(NOISY, rate=rate), make("hover")
+    for with_sensors in functools.partial(make, "hover"), functools.partial(dataclasses.replace, made):
+        with pytest.raises(ValueError, match=rf"'noisy' measures at {rate:g} Hz; give at most the control rate, 100"):
+            with_sensors(sensors=(fast,))
 
 
 @pytest.mark.parametrize("rate", [None, 100.0, 100 * (1 + 1e-7)])

@@ -80,6 +80,7 @@ class Env:
         check_process()
         episode.check_period(self)
         check_sensors(self.sensors, self.dt)
+        object.__setattr__(self, "delay", randomize.delay_bounds(self.delay, self.task.duration))
         of_team = [model.name for model in self.physics.physics.models if model.of_team]
         if of_team and self.task.ends == "drone":
             raise UserError(

@@ -1,5 +1,7 @@
 """Randomized parameters, sensor noise, delay, wind and pushes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,9 +123,13 @@ def test_a_privileged_observation_has_the_parameters_of_the_episode():
 
 
 def test_bounds_of_a_delay_are_checked():
+    made = make("hover")
     for delay in (0.02, 0.01), (0.0, 5.0), (-0.01, 0.01), (0.01,), (0.0, np.nan):
         with pytest.raises(ValueError, match="delay"):
             make("hover", delay=delay)
+        with pytest.raises(ValueError, match="delay"):
+            dataclasses.replace(made, delay=delay)
+    assert dataclasses.replace(made, delay=0.02).delay_steps == (2, 2)
     assert make("hover", delay=(0.02, 0.02)).privileged_size == 0
 
 

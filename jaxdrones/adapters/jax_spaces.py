@@ -20,8 +20,10 @@ class Box:
         self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Uniform sample between the bounds."""
-        return jax.random.uniform(key, self.shape, minval=self.low, maxval=self.high).astype(self.dtype)
+        """Uniform sample between the bounds, which are -1 and 1 for unbounded entries."""
+        bounded = jnp.isfinite(self.low) & jnp.isfinite(self.high)
+        low, high = jnp.where(bounded, self.low, -1.0), jnp.where(bounded, self.high, 1.0)
+        return jax.random.uniform(key, self.shape, minval=low, maxval=high).astype(self.dtype)
 
     def contains(self, x: Any) -> jax.Array:
         """Whether all entries of `x` are between the bounds."""

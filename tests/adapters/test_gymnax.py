@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import assert_same_kind, mostly_slow
 
-from jaxdrones.adapters import gymnax, jaxmarl
+from jaxdrones.adapters import gymnax, jax_spaces, jaxmarl
 from jaxdrones.envs import TASKS, AutoReset, make
 
 pytestmark = pytest.mark.float32
@@ -132,6 +132,8 @@ def test_samples_are_in_their_spaces(env_of):
     assert env.observation_space().contains(obs)
     assert env.action_space().contains(env.action_space().sample(KEY))
     assert not env.action_space().contains(jnp.full(8, 2.0))
+    unbounded = jax_spaces.Box(jnp.array([-3.0, -jnp.inf]), jnp.array([-2.0, jnp.inf]), (2,))
+    assert unbounded.contains(unbounded.sample(KEY))  # not NaN
 
 
 @pytest.mark.needs("gymnax")

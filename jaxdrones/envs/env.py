@@ -206,8 +206,7 @@ class Env:
     @in_full_precision
     def begin(self, key: Key, progress: Fraction = 1.0) -> tuple[Float[Array, "n d"], World]:
         """`reset` without images."""
-        if not is_traced(self.params):
-            _ = self.term_sizes  # checks functions that were replaced, such as a disturbance
+        _ = is_traced(self.params) or self.term_sizes  # checks functions that were replaced, such as a disturbance
         world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)
         return self.compiled(episode.first_observation)(key, world, rate)

@@ -101,7 +101,7 @@ def check_loads(physics: Physics, params: Params, scene: Scene, drawn: Params, d
 
 @checked
 def random_pushes(
-    force: Annotated[float, number("share of the weight", "force of a push", at_least=0)],
+    force: Annotated[float, number("fraction of the weight", "force of a push", at_least=0)],
     interval: Annotated[float, number("s", above=0, infinite=True)] = 1.0,
     duration: Annotated[float, number("s", above=0, infinite=True)] = 0.1,
 ) -> DisturbanceWithMemory:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
-from jaxdrones.checks import check_switch, check_vehicle, look_up, short_repr
+from jaxdrones.checks import check_number, check_switch, check_vehicle, look_up, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
@@ -276,7 +276,9 @@ def _vision(
 ) -> Vision | None:
     images = task.vision if images is None else images
     if images:
-        return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
+        made = make_vision(step, images, camera or task.camera or Camera(), dt, scene)
+        check_number("latency of the camera", made.camera.latency, "s, less than an episode", below=task.duration)
+        return made
     if camera is not None:
         raise UserError("camera is given without vision; give for example vision=('depth',), or leave it out")
     return None

@@ -108,7 +108,7 @@ class Camera:
 
 
 _AMOUNT = number(name="{argument} of {function}", at_least=0)
-_SHARE = number("a share", "{argument} of {function}", at_least=0, at_most=1)
+_SHARE = number("a fraction", "{argument} of {function}", at_least=0, at_most=1)
 
 
 @checked

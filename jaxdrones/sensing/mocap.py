@@ -29,7 +29,7 @@ class MotionCaptureSystem:
     """Poses per second."""
     delay: Annotated[float, _AMOUNT] = 0.0
     """Age of a pose when it arrives, s."""
-    dropout: Annotated[float, number("a share", _NAME, at_least=0, at_most=1)] = 0.0
+    dropout: Annotated[float, number("a fraction", _NAME, at_least=0, at_most=1)] = 0.0
     """Fraction of lost poses."""
     pos_noise: Annotated[float, _AMOUNT] = 0.0
     """Standard deviation of each coordinate, m."""

@@ -87,7 +87,7 @@ def range_finder(
     max_range: Annotated[float, number("m", "{argument} of a range finder", above=0)],
     rate: float | None = None,
     noise: Annotated[float, number("m", "{argument} of a range finder", at_least=0)] = 0.0,
-    dropout: Annotated[float, number("a share", "{argument} of a range finder", at_least=0, at_most=1)] = 0.0,
+    dropout: Annotated[float, number("a fraction", "{argument} of a range finder", at_least=0, at_most=1)] = 0.0,
     offset: Annotated[tuple[float, float, float], _OFFSET] = (0.0, 0.0, 0.0),
     orientation: Annotated[tuple[float, ...], quaternion("{argument} of a range finder")] = _IDENTITY,
 ) -> Sensor:
@@ -194,7 +194,7 @@ def time_of_flight(
 def optical_flow(
     rate: float | None = 100.0,
     noise: Annotated[float, number("rad/s", "{argument} of {function}", at_least=0)] = 0.0,
-    dropout: Annotated[float, number("a share", "{argument} of {function}", at_least=0, at_most=1)] = 0.0,
+    dropout: Annotated[float, number("a fraction", "{argument} of {function}", at_least=0, at_most=1)] = 0.0,
 ) -> Sensor:
     """Optical flow sensor, the PMW3901; its reading (2,) is the flow backward and to the right, rad/s.
 

@@ -263,6 +263,10 @@ MISTAKES = [
         dict(task="hover", vision=("rgb",), camera=jd.Camera(rate=200.0)),
         r"rate of the camera is 200 images/s; give at most the control rate, 100",
     ),
+    (
+        dict(task="hover", vision=("rgb",), camera=jd.Camera(latency=30.0)),  # milliseconds
+        "latency of the camera is 30.0; give a number below 5",
+    ),
     (dict(task="hover", vision=("grey",)), "unknown image 'grey'"),
     (dict(task="hover", effects=("drga",)), "unknown effect 'drga'; did you mean 'drag'"),
     (

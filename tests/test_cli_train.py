@@ -183,12 +183,14 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
     assert [row["update"] for row in Run(folder).history()] == [0, 1, 2, 3, 4]
 
 
-def test_a_policy_of_another_vehicle_than_that_of_the_training_is_named(capsys, monkeypatch):
+def test_a_policy_of_another_vehicle_than_that_of_the_training_is_named(capsys, monkeypatch, tmp_path):
     """--from keeps its parameters only."""
     run = argparse.Namespace(recipe=lambda: Recipe.of("hover", vehicle="racer"), policy=lambda env: None)
     monkeypatch.setattr(train_request, "open_policy", lambda *_: run)
     for options, warned in ([], True), (["--vehicle", "racer"], False), (["--vehicle", "hb"], False):
-        options = make_parser().parse_args(["train", "hover", "--from", "runs/racer", *options])
+        options = make_parser().parse_args(
+            ["train", "hover", "--from", "runs/racer", "--output", str(tmp_path / "run"), *options]
+        )
         request = Request.of(options)
         request.first_policy(request.recipe({}))
         warning = "runs/racer was trained with the vehicle racer, .* this training is with cf2x; give --vehicle racer"

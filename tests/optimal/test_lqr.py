@@ -170,41 +170,43 @@ def test_beyond_a_tilt_of_90_degrees_the_feedback_has_the_tracking_error():
         assert np.allclose(found, expected, rtol=0, atol=1e-12) == same
 
 
-def test_the_feedback_is_linear_near_the_reference():
+@functools.cache
+def regulator():
+    """Parameters and reference of a hover, and the gain of its regulator, of rotors with a lag."""
     params, state = some_state()
-    settings = lqr.settings(make_step(dt=DT))
-    reference = hover(params, state)
+    settings = lqr.settings(make_step(rotors=jd.lagging_rotors, dt=DT))
+    return params, hover(params, state), jit_unoptimized(lambda: lqr.init(settings, params, state).gain)()
 
-    @jit_unoptimized
-    def commands(z):
-        gain, there = lqr.init(settings, params, state).gain, displaced(params, reference, z)
-        linear = reference.rpm - params.hover_rpm * (gain @ feedback_error(params, there, reference))
-        return lqr.feedback(params, gain, there, reference, reference.rpm), linear
 
-    found, linear = commands(0.02 * jnp.asarray(np.random.default_rng(3).uniform(-1, 1, 16)))
+def test_the_feedback_is_linear_near_the_reference():
+    params, reference, gain = regulator()
+    there = displaced(params, reference, 0.02 * jnp.asarray(np.random.default_rng(3).uniform(-1, 1, 16)))
+    found = lqr.feedback(params, gain, there, reference, reference.rpm)
+    linear = reference.rpm - params.hover_rpm * (gain @ feedback_error(params, there, reference))
     np.testing.assert_allclose(found, linear, rtol=1e-12)
 
 
 def test_from_afar_a_drone_approaches_at_the_speed_from_which_it_stops_at_the_target():
     """At sqrt(2 a s) with s the distance, less what the linear feedback near the target adds to it."""
-    params, state = some_state()
-    settings = lqr.settings(make_step(dt=DT))
-    reference = hover(params, state)
-
-    @functools.partial(jit_unoptimized, static_argnums=3)
-    def command(pos, direction, limit, axes):
-        axes = slice(*axes)
-        gain = lqr.init(settings, params, state).gain
-        rate = jnp.linalg.norm(gain[:, axes]) / jnp.linalg.norm(gain[:, 6:9][:, axes])
-        speed = jnp.sqrt(2 * limit * jnp.linalg.norm(pos) - (limit / rate) ** 2)
-        there = reference.replace(pos=pos, vel=-speed * direction)
-        return lqr.feedback(params, gain, there, reference, reference.rpm)
-
-    level, upright = jnp.array([0.6, -0.8, 0.0]), jnp.array([0.0, 0.0, 1.0])
+    params, reference, gain = regulator()
+    level, upright = np.array([0.6, -0.8, 0.0]), np.array([0.0, 0.0, 1.0])
     for distance in (5.0, 50.0):
-        for direction, limit, axes in ((level, 0.6 / 2, (0, 2)), (-upright, 0.3, (2, 3))):
-            found = command(distance * direction, direction, limit * float(params.gravity), axes)
+        for direction, limit, axes in ((level, 0.6 / 2, slice(2)), (-upright, 0.3, slice(2, 3))):
+            acc = limit * float(params.gravity)
+            rate = np.linalg.norm(gain[:, axes]) / np.linalg.norm(gain[:, 6:9][:, axes])
+            speed = np.sqrt(2 * acc * distance - (acc / rate) ** 2)
+            there = reference.replace(pos=jnp.array(distance * direction), vel=jnp.array(-speed * direction))
+            found = lqr.feedback(params, gain, there, reference, reference.rpm)
             np.testing.assert_allclose(found, reference.rpm, rtol=1e-9)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_target_far_above_or_below_asks_for_thirty_percent_of_the_rotor_speed(side):
+    """Rotors with a lag that have reached it keep it, although their speeds are fed back."""
+    params, reference, gain = regulator()
+    rpm = (1 + 0.3 * side) * reference.rpm
+    below = reference.replace(pos=jnp.array([0.0, 0.0, -100.0 * side]), rpm=rpm)
+    np.testing.assert_allclose(lqr.feedback(params, gain, below, reference, reference.rpm), rpm, rtol=1e-9)
 
 
 @pytest.mark.slow

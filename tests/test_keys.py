@@ -33,7 +33,7 @@ EVERYTHING = dict(
         ),
     ),
     scene=lambda key: Scene.of(Sphere(pos=jax.random.uniform(key, (3,)) + 50.0, radius=0.1)),
-    effects=(lambda params, state, scene: jd.Wrench.of_force(0 * scene.spheres.pos[0]),),
+    effects=(jd.drag, jd.external_force, lambda params, state, scene: jd.Wrench.of_force(0 * scene.spheres.pos[0])),
 )
 SMALL = dict(updates=2, worlds=3, horizon=2, hidden_sizes=(2,))
 CRITIC = dict(critic_hidden_sizes=(2,))
@@ -164,7 +164,7 @@ def test_noise_and_pushes_of_a_step_have_keys_of_their_own():
 class Toss:
     """A world that draws in every step; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 2, (), None
+    drones, action_size, observation_size, dt, steps, constant_fields, vision, sets = 1, 1, 2, 0.1, 2, (), None, ()
 
     def reset(self, key):
         x = jax.random.uniform(jax.random.fold_in(key, 0), (1, 2))

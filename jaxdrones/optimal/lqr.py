@@ -5,7 +5,6 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked
@@ -23,7 +22,6 @@ from jaxdrones.vector import safe_sqrt
 _DOUBLINGS = 20  # a million control steps
 _TILT = 0.6  # largest tilt that errors of position and velocity ask for, rad
 _LIFT = 0.3  # largest change of the rotor speeds that they ask for, over that of hover
-_TURNS = np.r_[3:6, 9:16]  # attitude, angular velocity and rotor speeds in a difference
 
 
 class Settings(PyTreeNode):
@@ -94,13 +92,13 @@ def feedback(
     position and velocity ask for at most `_TILT` and `_LIFT`, which leaves the attitude its share of the rotor speeds.
     """
     error = feedback_error(params, state, _on_the_way(params, gain, state, target))
-    translation = gain @ error.at[_TURNS].set(0)
+    moved = error.at[3:6].set(0).at[9:16].set(0)  # without attitude, angular velocity and rotor speeds
+    translation, rotation = gain @ moved, gain @ (error - moved)
     collective = jnp.mean(translation)
     lateral = translation - collective
     lift = _LIFT * (1 + jnp.sum(gain[:, 12:16]) / 4)  # rotors with a lag also feed their speeds back
     most = _TILT * _length(gain[:, 3])
     lateral = lateral * most / jnp.maximum(jnp.maximum(most, _length(lateral)), jnp.finfo(most.dtype).tiny)
-    rotation = gain[:, _TURNS] @ error[_TURNS]
     return limited(params, rpm - command_unit(params) * (rotation + lateral + jnp.clip(collective, -lift, lift)))
 
 

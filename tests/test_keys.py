@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from double_integrator import outcome
+from double_integrator import Untasked, outcome
 from helpers import Keys, mostly_slow
 
 import jaxdrones as jd
@@ -161,10 +161,10 @@ def test_noise_and_pushes_of_a_step_have_keys_of_their_own():
     assert not np.array_equal(seen["noise"], seen["disturbance"])
 
 
-class Toss:
+class Toss(Untasked):
     """A world that draws in every step; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, constant_fields, vision, sets = 1, 1, 2, 0.1, 2, (), None, ()
+    drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 2, (), None
 
     def reset(self, key):
         x = jax.random.uniform(jax.random.fold_in(key, 0), (1, 2))

@@ -120,7 +120,10 @@ def test_an_averaging_time_that_is_not_positive_is_refused(time):
         (lambda: Noise(correlation=0), "correlation of Noise is 0; give a positive number"),
         (lambda: Noise(limit=np.nan), "limit of Noise is nan; give a positive number"),
         (lambda: Noise(scale="a"), "scale of Noise is 'a'"),
-        (lambda: MotionCaptureSystem(dropout=2), r"dropout of MotionCaptureSystem is 2; give .* at most 1 \(a fraction\)"),
+        (
+            lambda: MotionCaptureSystem(dropout=2),
+            r"dropout of MotionCaptureSystem is 2; give .* at most 1 \(a fraction\)",
+        ),
         (lambda: MotionCaptureSystem(rate=0), "rate of MotionCaptureSystem is 0; give a positive number"),
         (lambda: MotionCaptureSystem(delay=-0.1), "delay of MotionCaptureSystem is -0.1"),
         (lambda: MotionCaptureSystem(pos_noise=np.inf), "pos_noise of MotionCaptureSystem is inf"),

@@ -329,7 +329,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     ]
     assert main([*arguments, "--seed", "3", "--json", "--output", str(tmp_path)]) == 0
     captured = capsys.readouterr()
-    assert "warning: compilation took all of --budget 0.001s; it makes one update; --resume continues" in captured.err
+    assert "warning: compilation took all of --budget 0.001s; one update is made, --resume adds more" in captured.err
     printed = json.loads(captured.out)
     assert [report["seed"] for report in printed["seeds"]] == [3, 4] and printed["best_seed"] in (3, 4)
     assert all(report["updates"] == 1 for report in printed["seeds"])  # the least, when there is no time

@@ -18,8 +18,8 @@ from jaxdrones.accelerate.fitting import (
     NoKernelError,
     can_be_a_kernel,
     fits_number_by_number,
+    has_few_entries,
     has_reverse_rule,
-    is_small,
 )
 from jaxdrones.accelerate.soa import over_last_axis
 
@@ -54,7 +54,7 @@ def _called(function: Callable, tree: Any, leaves: Sequence) -> Any:
 
 
 def _fits(program: Any) -> bool:
-    return can_be_a_kernel(program) and fits_number_by_number(program) and is_small(program)
+    return can_be_a_kernel(program) and fits_number_by_number(program) and has_few_entries(program)
 
 
 def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: int | None) -> list[Array]:

@@ -96,7 +96,7 @@ def fits_number_by_number(program: Any) -> bool:
     return max(sizes, default=0) <= LARGEST and sum(sizes) <= _MAX_NUMBERS
 
 
-def is_small(program: Any) -> bool:
+def has_few_entries(program: Any) -> bool:
     """Whether a program as a whole has few enough entries to split."""
     return _numbers(program) <= _MAX_APART
 

@@ -58,7 +58,7 @@ class Deadlines:
     def start(self) -> None:
         """Warn if compilation took the time of a whole run."""
         if self.seconds is not None and time.perf_counter() - self._begin > self.seconds:
-            print_warning(f"compilation took all of --budget {self._text}; it makes one update; --resume continues")
+            print_warning(f"compilation took all of --budget {self._text}; one update is made, --resume adds more")
 
     def next(self) -> float | None:
         """End of the next training, s on the clock of `time.perf_counter`; `None` without a limit."""

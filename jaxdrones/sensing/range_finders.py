@@ -66,7 +66,7 @@ def ray(
 def _to_shape(shape: Obstacle, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:
     local_origin, local_direction = shape.to_local(origin), rotation.rotate_inverse(shape.quat, direction)
     first, last = shape.interval(components(local_origin), components(local_direction))
-    return jnp.where((first <= last) & (last >= 0) & shape.active, jnp.maximum(first, 0), jnp.inf)
+    return jnp.where((first <= last) & (last >= 0) & shape.active, jnp.where(first > 0, first, 0), jnp.inf)
 
 
 def _to_ground(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:

@@ -155,6 +155,14 @@ def test_noise_has_its_deviation_and_dropouts_read_the_limit():
     np.testing.assert_allclose([ranges[~lost].mean(), ranges[~lost].std()], [8.5, 0.05], rtol=0.05)
 
 
+def test_a_ray_that_starts_in_the_plane_of_a_face_has_a_zero_gradient():
+    """Its range jumps from zero to infinity there."""
+    box = Scene.of(Box(pos=(0.0, 0, 1), size=(1, 1, 1)), ground=False)
+    slope = jit_unoptimized(jax.grad(jd.sensing.ray, (1, 2)))
+    slopes = slope(box, jnp.array([-0.5, 0.0, 1.0]), jnp.array([0.0, 1.0, 0.0]))
+    np.testing.assert_array_equal(slopes, 0)
+
+
 @pytest.mark.slow
 def test_the_gradient_of_a_range_is_that_of_the_way_to_the_wall():
     @jit_unoptimized

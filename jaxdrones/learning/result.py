@@ -122,7 +122,7 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
                 `learning.networks.OwnNetwork`.
             callback: function, or several, called after every update; see `Callback`.
             state: state to continue from, the `train_state` of a result with the same worlds, network and episodes; up
-                to `config.updates` updates in total.
+                to `config.updates` updates in total. Vehicle, action type and rewards may differ.
 
         Raises:
             ValueError: no random key, the settings of another learner, or a state that does not fit them or is without
@@ -190,12 +190,14 @@ def _check_state(state: Any, init: Callable, network: Any) -> None:
         {jax.tree_util.keystr(path): jnp.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(tree)}
         for tree in (expected, state)
     )
+    remedy = "continue with the environment, the worlds and the network that the state was trained with"
     for name in shapes | found:
         if shapes.get(name) != found.get(name):
-            raise UserError(
-                f"state{name} has shape {found.get(name, 'none')}, expected {shapes.get(name, 'none')}; continue with "
-                "the environment, the worlds and the network that the state was trained with"
-            )
+            of_state, of_init = found.get(name, "none"), shapes.get(name, "none")
+            raise UserError(f"state{name} has shape {of_state}, expected {of_init}; {remedy}")
+    structures: list[Any] = [jax.tree.structure(x.worlds) for x in (expected, state)]
+    if structures[0] != structures[1]:
+        raise UserError(f"state is of another task or control period; {remedy}")
 
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:

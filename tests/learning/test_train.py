@@ -264,7 +264,10 @@ def test_a_state_that_does_not_fit_is_refused():
     """Other worlds, other networks, another learner, and what is no state."""
     env, config = DoubleIntegrator(), dataclasses.replace(SMALL[bptt], updates=5)
     state = bptt.init(KEY, env, config)
+    worlds, world = state.worlds, state.worlds.episodes.world
+    other = worlds.replace(episodes=worlds.episodes.replace(world=world.replace(poses=())))  # without arrays, like dt
     for wrong, change, said in (
+        (state.replace(worlds=other), {}, "state is of another task or control period; continue with"),
         (state, {"worlds": 2 * config.worlds}, r"state\S+ has shape \(\d+,.*, expected"),
         (state, {"hidden_sizes": (5,)}, r"state.policy\S+ has shape .*, expected .*; continue with the environment"),
         (ppo.init(KEY, env, SMALL[ppo]), {}, "state is of jaxdrones.learning.ppo; give one of"),

@@ -190,8 +190,7 @@ def _learn(
 ):
     """Epochs of gradient steps on a trajectory: (policy parameters, log_std, critic), optimizer state, metrics."""
     batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise, ends_alone))
-    rate, own = state.learning_rate, config.critic_learning_rate
-    rates = rate, rate, jnp.where(own > 0, jnp.minimum(own, _MAX_RATE_RATIO * rate), rate)
+    rates = _rates(config, state.learning_rate)
 
     def cost(variables, minibatch):
         params, log_std, critic = variables
@@ -210,6 +209,12 @@ def _learn(
     kl = sharding.mean_over_devices(cost(carry[0], jax.tree.map(lambda x: x[0], batch))[1]["kl"])
     metrics = {"value_loss": jnp.mean(value_losses), "kl": kl}
     return *carry, metrics | {"nonfinite_gradients": result.count_nonfinite(norms)}
+
+
+def _rates(config: Config, rate: Array) -> tuple[Array, Array, Array]:
+    """Learning rates of policy, standard deviations and critic."""
+    own = config.critic_learning_rate
+    return rate, rate, jnp.where(own > 0, jnp.minimum(own, _MAX_RATE_RATIO * rate), rate)
 
 
 def _moved(rate: Scalar, variables: Any, step: Any) -> Any:

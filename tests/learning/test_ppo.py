@@ -36,6 +36,12 @@ def test_the_loss_of_ppo_has_no_gradient_where_the_clipped_ratio_is_worse_and_fa
     assert slope_of(jnp.zeros(1), clipped, 0.1).item() == pytest.approx(-0.1)
 
 
+@pytest.mark.parametrize(("own", "expected"), [(0.0, 1e-3), (5e-3, 5e-3), (1.0, 2e-2)])
+def test_the_learning_rate_of_the_critic_is_its_own_up_to_20_times_that_of_the_policy(own, expected):
+    rates = ppo._rates(ppo.Config(critic_learning_rate=own), jnp.asarray(1e-3))
+    np.testing.assert_allclose(rates, [1e-3, 1e-3, expected])
+
+
 @pytest.mark.slow
 def test_the_critic_learns_at_its_own_rate_and_the_policy_as_before():
     env = jd.make("hover", substeps=1)

@@ -184,7 +184,7 @@ def make(
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=delay_bounds(preset["delay"] if delay is None else delay, task.duration),
-        vision=_vision(task, step, vision, camera, dt, scene),
+        vision=_vision(task, step, vision, camera, scene),
         sensors=sensors,
         scene=scene,
         vehicle=_name(vehicle, randomize),
@@ -271,12 +271,11 @@ def _vision(
     step: Step,
     images: Sequence[str] | None,
     camera: Camera | None,
-    dt: float,
     scene: Scene | DrawScene,
 ) -> Vision | None:
     images = task.vision if images is None else images
     if images:
-        made = make_vision(step, images, camera or task.camera or Camera(), dt, scene)
+        made = make_vision(step, images, camera or task.camera or Camera(), scene)
         check_number("latency of the camera", made.camera.latency, "s, less than an episode", below=task.duration)
         return made
     if camera is not None:

@@ -51,21 +51,36 @@ class Vision:
     """Function that renders the images of a team."""
     on_host: bool
     """Whether `render` runs outside of JAX, one image after the other."""
-    every: float
-    """Control steps between images; the k-th one is from the first step at or after k times as many."""
-    delay: int
-    """Control steps between the exposure and the observation of an image."""
 
     def __str__(self) -> str:
         width, height = self.camera.resolution
-        rate = f" every {self.every:g} steps" if self.every > 1 else ""
-        late = f", {self.delay} steps late" if self.delay else ""
+        rate = f" at {self.camera.rate:g} images/s" if self.camera.rate else ""
+        late = f", {self.camera.latency:g} s late" if self.camera.latency else ""
         return f"{' and '.join(self.images)} of {width} x {height} pixels{rate}{late}"
 
-    def is_due(self, step: Array) -> Array:
-        """Whether a new image is observed after a control step."""
-        exposed = step - self.delay
-        return is_due(exposed, self.every) & (exposed > 0)
+    def every(self, dt: float) -> float:
+        """Control steps of `dt` (s) between images; the k-th one is from the first step at or after k times as many.
+
+        Raises:
+            ValueError: more images than control steps.
+        """
+        every = 1.0 if self.camera.rate is None else 1 / (self.camera.rate * dt)
+        every = round(every) if abs(every - round(every)) < 1e-6 * every else every
+        if every < 1:
+            raise UserError(
+                f"the rate of the camera is {self.camera.rate:g} images/s; give at most the control rate, {1 / dt:g}, "
+                "or a higher control_hz"
+            )
+        return every
+
+    def delay(self, dt: float) -> int:
+        """Control steps of `dt` (s) between the exposure and the observation of an image."""
+        return round(self.camera.latency / dt)
+
+    def is_due(self, step: Array, dt: float) -> Array:
+        """Whether a new image is observed after a control step of `dt` (s)."""
+        exposed = step - self.delay(dt)
+        return is_due(exposed, self.every(dt)) & (exposed > 0)
 
     def look(self, params: Params, drones: State, scene: Scene) -> dict[str, Array]:
         """Images of a state, without noise."""
@@ -75,16 +90,16 @@ class Vision:
     def first(self, key: Any, world: World) -> World:
         """World at the start of an episode with its images."""
         pose = _pose(world.drones)
-        poses = jnp.tile(pose[None], (self.delay, 1, 1))
+        poses = jnp.tile(pose[None], (self.delay(world.dt), 1, 1))
         return world.replace(images=self._exposed(key, world.params, pose, world.scene), poses=poses)
 
     def next(self, key: Any, world: World) -> World:
         """World after a control step with its images."""
         poses = jnp.concatenate([world.poses, _pose(world.drones)[None]])
-        if self.every == 1:
+        if self.every(world.dt) == 1:
             images = self._exposed(key, world.params, poses[0], world.scene)
         else:
-            images = self._where(self.is_due(world.step), _PIXELS, key, world, poses[0])
+            images = self._where(self.is_due(world.step, world.dt), _PIXELS, key, world, poses[0])
         return world.replace(images=images, poses=poses[1:])
 
     def renewed(self, key: Any, world: World, ended: Array) -> World:
@@ -134,20 +149,12 @@ def make_vision(
     step: Step,
     images: Annotated[Sequence[str], choices("image", IMAGES, "'depth'")],
     camera: OneCamera,
-    dt: float,
     scene: Scene | DrawScene,
 ) -> Vision:
-    """Build the vision of an environment with a control period of `dt` s: images of the camera on every drone.
+    """Build the vision of an environment: images of the camera on every drone.
 
     A Bullet step renders the images itself, and was built with the scene unless that is random.
     """
-    every = 1.0 if camera.rate is None else 1 / (camera.rate * dt)
-    every = round(every) if abs(every - round(every)) < 1e-6 * every else every
-    if every < 1:
-        raise UserError(
-            f"the rate of the camera is {camera.rate:g} images/s; give at most the control rate, {1 / dt:g}, or a "
-            "higher control_hz"
-        )
     drawn = not isinstance(scene, Scene)
 
     def take(params: Params, drones: State, scene: Scene) -> Images:
@@ -155,7 +162,7 @@ def make_vision(
             return step.camera(params, drones, camera, scene if drawn else None)
         return render(scene, params, drones, camera)
 
-    return Vision(tuple(images), camera, take, isinstance(step, HostStep), every, round(camera.latency / dt))
+    return Vision(tuple(images), camera, take, isinstance(step, HostStep))
 
 
 def _pose(drones: State) -> Float[Array, "n 7"]:

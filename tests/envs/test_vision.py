@@ -41,16 +41,16 @@ def env():
     return sees(rate=100 / 3, latency=0.04)
 
 
-@pytest.mark.parametrize("delay", [0, 1, 3])
-def test_an_image_is_of_the_pose_some_control_steps_ago(delay):
-    """Of the start until then."""
+@pytest.mark.parametrize(("delay", "dt"), [(0, 0.01), (1, 0.02), (3, 0.01)])
+def test_an_image_is_of_the_pose_some_control_steps_ago(delay, dt):
+    """Of the start until then. The latency is in seconds, the control period that of the world."""
 
     def render(params, drones, scene):
         return jd.sensing.Images(None, drones.pos[:, 2], None)
 
-    vision = Vision(("depth",), CAMERA, render, False, 1.0, delay)
+    vision = Vision(("depth",), dataclasses.replace(CAMERA, latency=dt * delay), render, False)
     at = [jd.State.at_rest([[0.0, 0, z]]) for z in range(6)]
-    world = World(None, at[0], None, None, None, jnp.asarray(0), jnp.ones(1, bool), 0.01)
+    world = World(None, at[0], None, None, None, jnp.asarray(0), jnp.ones(1, bool), dt)
     world = vision.first(None, world)
     for k in range(1, 6):
         world = vision.next(None, world.replace(drones=at[k], step=jnp.asarray(k)))
@@ -91,8 +91,14 @@ def test_an_image_shows_the_state_of_its_time_until_the_next_one_comes(env):
 def test_a_rate_that_does_not_divide_the_control_rate_is_kept():
     """Of 30 images per second at 100 Hz, the k-th one is from the first step at or after k / 30 s."""
     vision = sees(rate=30.0, latency=0.02).vision
-    seen = np.flatnonzero(vision.is_due(jnp.arange(1003)))
+    seen = np.flatnonzero(vision.is_due(jnp.arange(1003), 0.01))
     np.testing.assert_array_equal(seen - 2, np.ceil(100 * np.arange(1, 301) / 30 - 1e-9))
+
+
+def test_a_camera_that_is_too_fast_for_a_replaced_control_period_is_refused(env):
+    np.testing.assert_array_equal(np.flatnonzero(env.vision.is_due(jnp.arange(9), 0.02)), [4, 5, 7, 8])
+    with pytest.raises(ValueError, match=r"rate of the camera is 33.3333 images/s; give at most the control rate, 25,"):
+        dataclasses.replace(env, dt=0.04, physics=jd.make_step(dt=0.04))
 
 
 @pytest.mark.slow  # its quick sibling is in test_exposures.py
@@ -137,7 +143,7 @@ def test_worlds_of_different_ages_see_what_each_sees_alone_and_start_anew(env):
 @pytest.mark.slow
 def test_the_contract_holds_with_images(env):
     check_env(env, steps=3)
-    assert "depth of 8 x 6 pixels every 3 steps, 4 steps late" in repr(env)
+    assert "depth of 8 x 6 pixels at 33.3333 images/s, 0.04 s late" in repr(env)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Drones that cross below each other meet at one axis, in each other's downwash, and their altitude is measured."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.envs import make
+from jaxdrones.tasks import wake
 from jaxdrones.tasks.wake import HEIGHT
 
 KEY = jax.random.key(0)
@@ -45,6 +48,19 @@ def test_the_drones_fly_in_the_wakes_of_each_other_unless_told_otherwise():
         falls.append(np.asarray(world.drones.vel[:, 2]))
     assert falls[0][0] < -0.01 and abs(falls[1][0]) < 1e-3
     np.testing.assert_allclose(falls[0][1], falls[1][1], atol=1e-6)
+
+
+def test_the_deviation_counts_the_steps_after_the_first_second():
+    """As the criterion of success does, without a flight."""
+    errors, squares = np.random.default_rng(0).normal(size=(30, 2)), jnp.zeros(2)
+    for step, z in enumerate(errors, 1):
+        drones = SimpleNamespace(pos=jnp.asarray(z)[:, None] * jnp.array([[0, 0, 1]]))
+        variables = {"altitude": jnp.zeros(2), "squares": squares}
+        world = SimpleNamespace(step=step, dt=0.04, drones=drones, variables=variables)
+        squares = wake._advance(None, world)["squares"]
+    world.variables = variables | {"squares": squares}
+    expected = np.sqrt(np.mean(errors[25:] ** 2, axis=0))
+    np.testing.assert_allclose(wake._altitude_deviation(None, world), expected)
 
 
 @pytest.mark.slow

@@ -131,7 +131,6 @@ def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
     assert jax.jit(jax.grad(cost))(9.4, 3.0) > 0
 
 
-@pytest.mark.slow
 def test_traversability_is_the_free_way_in_widths_of_the_drone():
     width = 2 * ENV().params.collision_radius[0]
     metric = ENV().task.metrics["traversability"]

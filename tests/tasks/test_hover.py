@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,6 +7,7 @@ from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones import rotation
+from jaxdrones.tasks.starts import thrown
 
 EAST = jnp.array([[1.0, 0.0, 0.0]])
 
@@ -38,3 +41,11 @@ def test_the_penalty_of_the_heading_is_one_minus_its_cosine_and_absent_by_defaul
     yaw = jnp.radians(jnp.array([0.0, 30.0, -90.0, 180.0]))
     np.testing.assert_allclose(jax.jit(jax.vmap(reward))(yaw), -0.5 * (1 - np.cos(yaw)), atol=5e-3)
     assert "heading" not in jd.make("hover").task.rewards
+
+
+def test_the_numbers_of_a_random_start_are_drawn_for_themselves():
+    params = jd.repeat(jd.load_params("cf2x"), 2)
+    place = functools.partial(thrown, reach=1.0, speed=1.0, omega=1.0, tilt=1.0)
+    state = jit_unoptimized(place)(jax.random.key(0), params, jnp.zeros((2, 3)))
+    drawn = np.concatenate([state.pos, state.vel, state.omega], axis=1)
+    assert len(np.unique(np.abs(drawn))) == drawn.size

@@ -1,6 +1,7 @@
 """The crowd: random starts and goals at a constant density, and a touch that no control step misses."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from helpers import jit_unoptimized, mostly_slow, mostly_slow_rows
 
 from jaxdrones import rotation
 from jaxdrones.envs import make
-from jaxdrones.tasks import shaping
+from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.crowd import FLOOR
 from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
 
@@ -77,6 +78,28 @@ def test_the_heading_costs_one_minus_its_cosine_also_of_a_tilted_drone():
 
     headings = np.array([0.0, 0.5, np.pi, -2.0])
     np.testing.assert_allclose(cost(headings), np.tile(1 - np.cos(headings), (2, 1)).T, atol=0.015)
+
+
+def test_the_desired_velocity_is_straight_to_the_target_and_slower_within_a_distance_of_it():
+    pos, target = jnp.array([[0.0, 0, 0], [3, 0, 0], [3, 4, 0]]), jnp.array([[3.0, 4, 0]])
+    task = SimpleNamespace(target_now=lambda world: SimpleNamespace(pos=target))
+    found = shaping.velocity_to_target(task, SimpleNamespace(drones=SimpleNamespace(pos=pos)), 2.0, 4.5)
+    np.testing.assert_allclose(found, [[1.2, 1.6, 0], [0, 2 * 4 / 4.5, 0], [0, 0, 0]])
+
+
+@pytest.mark.parametrize("speed", [0.0, 2.0])
+def test_the_margin_of_drones_grows_with_their_relative_and_closing_speed(speed):
+    """Two drones 0.3 m apart, one of which flies to the other one, or beside it."""
+    params = SimpleNamespace(collision_radius=jnp.array([0.05, 0.06]))
+    pos = jnp.array([[0.0, 0, 0], [0.3, 0, 0]])
+    for ahead in (1.0, 0.0):
+        vel = speed * jnp.array([[ahead, 1 - ahead, 0], [0, 0, 0]])
+        world = SimpleNamespace(params=params, drones=SimpleNamespace(pos=pos, vel=vel))
+        apart = np.hypot(0.3, 0.05)
+        closing = ahead * speed * 0.3 / apart
+        inside = 0.08 + 0.06 * np.hypot(speed, 0.1) + 0.3 * closing - (apart - 0.11)
+        expected = (1 + closing) * 0.04 * np.log1p(np.exp(inside / 0.04))
+        np.testing.assert_allclose(crossing._approach(None, world), [expected] * 2)
 
 
 def test_drones_that_pass_between_two_control_steps_have_touched():

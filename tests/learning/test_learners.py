@@ -103,6 +103,21 @@ def test_learning_rates_can_be_mapped():
     np.testing.assert_allclose(large, 10 * small, rtol=1e-2)
 
 
+def test_a_world_whose_episode_ends_goes_on_from_the_start_of_another_world_a_different_one_in_every_step():
+    env, key = DoubleIntegrator(), jax.random.key(0)
+    env.steps = 1
+
+    @jit_unoptimized
+    def observed(key):
+        starts = collect.draw_starts(key, env, 4)
+        worlds = collect.restart(key, collect.empty_worlds(env, 4), starts)
+        act = lambda noise, memory, obs: (memory, obs[..., :1], None)  # noqa: E731
+        return starts[0], collect.collect(key, env, act, worlds, 3, starts=starts)[1].obs
+
+    starts, obs = observed(key)
+    np.testing.assert_array_equal(obs, [jnp.roll(starts, -t, axis=0) for t in range(3)])
+
+
 @pytest.mark.float32
 @pytest.mark.parametrize("reset", mostly_slow([True, False], [True]))
 def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_one_could_end(reset):

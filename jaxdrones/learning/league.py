@@ -72,7 +72,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
 
 
 def against(past: Policy, policy: Policy) -> collect.Act:
-    """Actions of the first drones by a policy, of the others by past ones, each in an equal group of worlds."""
+    """Actions of the first drones by a policy, of the others by past ones, each in equally many worlds."""
 
     def act(policy: Policy, past: Policy, noise: Any, hidden_state: Any, obs: collect.Obs) -> tuple[Any, Array, Any]:
         count, worlds = len(jax.tree.leaves(past)[0]), len(state_vector(obs))
@@ -82,18 +82,15 @@ def against(past: Policy, policy: Policy) -> collect.Act:
                 f"{count}, on every device"
             )
 
-        def of_others(x: Array) -> Array:
-            return x[:, 1:].reshape(count, len(x) // count, *x[:, 1:].shape[1:])
+        def of_others(x: Array) -> Array:  # equally spaced worlds, so that a world has one policy on any device
+            return x[:, 1:].reshape(len(x) // count, count, *x[:, 1:].shape[1:])
 
         own = policy(jax.tree.map(lambda x: x[:, :1], obs))
         if state_vector(obs).shape[1] == 1:
             return hidden_state, own, None
-        others = jax.vmap(lambda policy, obs: policy(obs))(past, jax.tree.map(of_others, obs))
-        return (
-            hidden_state,
-            jnp.concatenate([own, others.reshape(len(own), others.shape[2], own.shape[-1])], axis=1),
-            None,
-        )
+        of_past = jax.vmap(lambda policy, obs: policy(obs), in_axes=(0, 1), out_axes=1)
+        others = of_past(past, jax.tree.map(of_others, obs))
+        return hidden_state, jnp.concatenate([own, others.reshape(worlds, *others.shape[2:])], axis=1), None
 
     return jax.tree_util.Partial(act, policy, jax.lax.stop_gradient(past))
 

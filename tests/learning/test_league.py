@@ -26,11 +26,14 @@ def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_pol
     policy = jit_unoptimized(lambda: league.init(KEY, env, CONFIG).policy)()
     past = jax.tree.map(lambda *x: jnp.stack(x), scaled(policy, 2.0), scaled(policy, -3.0))
     obs = jax.random.normal(KEY, (4, 3, env.observation_size))
-    _, action, _ = jit_unoptimized(lambda obs: league.against(past, policy)(None, None, obs))(obs)
+    against = jit_unoptimized(lambda obs: league.against(past, policy)(None, None, obs)[1])
+    action = against(obs)
     act = jit_unoptimized(lambda policy: policy(obs))
     np.testing.assert_allclose(action[:, 0], act(policy)[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(action[:2, 1:], act(scaled(policy, 2.0))[:2, 1:], rtol=1e-6)
-    np.testing.assert_allclose(action[2:, 1:], act(scaled(policy, -3.0))[2:, 1:], rtol=1e-6)
+    np.testing.assert_allclose(action[::2, 1:], act(scaled(policy, 2.0))[::2, 1:], rtol=1e-6)
+    np.testing.assert_allclose(action[1::2, 1:], act(scaled(policy, -3.0))[1::2, 1:], rtol=1e-6)
+    halves = jnp.concatenate([against(obs[:2]), against(obs[2:])])  # as on two devices
+    np.testing.assert_allclose(halves, action, rtol=1e-6)
 
 
 def test_a_training_from_a_policy_begins_against_that_policy():

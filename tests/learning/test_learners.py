@@ -156,6 +156,49 @@ def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learn
     np.testing.assert_allclose(metrics["return"], (3 * lasting + (16 - lasting)) / 16, rtol=1e-6)
 
 
+@pytest.fixture
+def three_worlds(monkeypatch):
+    """Trajectory of worlds that go on, are truncated in step 0, and terminate in step 1; values are the observations.
+
+    Those at the end of a step are 8, 16 and 24; those at its start are 7, 15 and 23. Critics are factors of them.
+    """
+    monkeypatch.setattr(shac, "critic_observation", lambda policy, obs, *_: obs)
+    monkeypatch.setattr(shac, "discounted_value", lambda config, critic, obs: critic * obs[..., 0])
+    obs = jnp.broadcast_to(8.0 * jnp.arange(1, 4)[:, None, None, None], (3, 3, 1, 1))
+    truncated, terminated, was_done = np.zeros((3, 3, 3, 1), bool)
+    truncated[0, 1], terminated[1, 2], was_done[1:, 1], was_done[2:, 2] = True, True, True, True
+    ends = dict(truncated=truncated, terminated=terminated, was_done=was_done)
+    own = {"reward": jnp.ones((3, 3, 1)), "obs": obs - 1, "final_obs": obs} | jax.tree.map(jnp.asarray, ends)
+    return collect.Trajectory(**dict.fromkeys(collect.Trajectory.__dataclass_fields__) | own)
+
+
+ACTS = types.SimpleNamespace(act=lambda hidden, obs: (hidden, obs))
+
+
+def test_the_cost_of_shac_is_that_of_the_discounted_rewards_and_of_the_value_after_them(three_worlds, monkeypatch):
+    """Half of the value counts, after half of the warmup."""
+    costs = []
+    monkeypatch.setattr(bptt, "policy_step", lambda *args, **_: costs.append(args[-1]))
+    state = types.SimpleNamespace(key=jax.random.key(0), step=3, target_critic=1.0)
+    with pytest.raises(TypeError):  # as no step is made
+        shac.update(None, shac.Config(gamma=0.5, horizon=3, updates=10, terminal_value_warmup=0.6), state)
+    worth = [1 + 1 / 2 + 1 / 4 + 24 / 8 / 2, 1 + 8 / 2 / 2, 1 + 1 / 2]
+    cost = jit_unoptimized(lambda trajectory: costs[0](ACTS, trajectory))
+    np.testing.assert_allclose(cost(three_worlds), -np.mean(worth) / 3)
+
+
+def test_the_critic_of_shac_learns_the_values_of_the_target_critic_in_steps_that_count(three_worlds):
+    config = shac.Config(gamma=0.5, gae_lambda=0.0, horizon=3, critic_steps=1)
+    critic, optimizer = jnp.zeros(()), shac._critic_optimizer(config)
+    state = types.SimpleNamespace(
+        policy=ACTS, critic=critic, target_critic=jnp.asarray(2.0), critic_opt_state=optimizer.init(critic)
+    )
+    fit = jit_unoptimized(lambda key, trajectory: shac._fit_critic(config, key, state, trajectory)[2]["loss"])
+    loss = fit(jax.random.key(0), three_worlds)
+    targets = [1 + 8, 1 + 16, 1 + 24, 1 + 8, 1 + 8, 1]  # reward and half of twice the value, of the steps that count
+    np.testing.assert_allclose(loss, 0.5**2 * np.sum(np.square(targets)) / 9)
+
+
 @pytest.mark.float32
 @pytest.mark.parametrize("ends", mostly_slow(["truncated", "terminated"], ["truncated"]))
 def test_an_episode_that_ends_inside_a_trajectory_of_shac_is_worth_the_same_as_one_that_ends_with_it(ends):

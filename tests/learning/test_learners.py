@@ -188,14 +188,17 @@ def test_the_cost_of_shac_is_that_of_the_discounted_rewards_and_of_the_value_aft
 
 
 def test_the_critic_of_shac_learns_the_values_of_the_target_critic_in_steps_that_count(three_worlds):
-    config = shac.Config(gamma=0.5, gae_lambda=0.0, horizon=3, critic_steps=1)
+    config = shac.Config(gamma=0.5, gae_lambda=1.0, horizon=3, critic_steps=1)
     critic, optimizer = jnp.zeros(()), shac._critic_optimizer(config)
     state = types.SimpleNamespace(
         policy=ACTS, critic=critic, target_critic=jnp.asarray(2.0), critic_opt_state=optimizer.init(critic)
     )
     fit = jit_unoptimized(lambda key, trajectory: shac._fit_critic(config, key, state, trajectory)[2]["loss"])
     loss = fit(jax.random.key(0), three_worlds)
-    targets = [1 + 8, 1 + 16, 1 + 24, 1 + 8, 1 + 8, 1]  # reward and half of twice the value, of the steps that count
+    now, later = 2 * np.array([7, 15, 23]), 2 * np.array([8, 16, 24])
+    a, b, c = 1 + later / 2 - now  # errors of one step, and below those of all steps to the end
+    goes_on, truncated, terminated = (a + b / 2 + c / 4, b + c / 2, c), (a,), (a + (1 - now[1]) / 2, 1 - now[1])
+    targets = np.concatenate([error + now[: len(error)] for error in (goes_on, truncated, terminated)])
     np.testing.assert_allclose(loss, 0.5**2 * np.sum(np.square(targets)) / 9)
 
 
@@ -258,15 +261,17 @@ def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
 def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_it(epochs, minibatches):
     env = DoubleIntegrator()
     config = dataclasses.replace(SMALL[ppo], epochs=epochs, minibatches=minibatches, max_learning_rate=10.0)
-    rates = jnp.array([1e-4, 3.0])
+    rates, updates, std = jnp.array([1e-4, 3.0, 3.0]), jnp.array([3, 3, 1]), jnp.array([0.4, 0.4, 0.05])
 
-    def update(rate):
-        state = ppo.init(jax.random.key(0), env, dataclasses.replace(config, learning_rate=rate))
-        return ppo.update(env, config, state)[1]
+    def update(rate, updates, std):
+        own = dataclasses.replace(config, learning_rate=rate, updates=updates, init_std=std)
+        return ppo.update(env, own, ppo.init(jax.random.key(0), env, own))[1]
 
-    metrics = jit_unoptimized(jax.vmap(update))(rates)
+    metrics = jit_unoptimized(jax.vmap(update))(rates, updates, std)
     assert 0 < metrics["kl"][0] < config.target_kl / 2 and metrics["kl"][1] > 2 * config.target_kl
-    np.testing.assert_allclose(metrics["learning_rate"], rates * jnp.array([1.2, 1 / 1.2]), rtol=1e-6)
+    moved = [1.2e-4, 3 / 1.2, config.min_learning_rate]  # the last one after the last update
+    np.testing.assert_allclose(metrics["learning_rate"], moved, rtol=1e-6)
+    np.testing.assert_allclose(metrics["action_std"][2], 0.05, rtol=1e-6)  # below min_std it has no room
 
 
 def optax_norm(tree):

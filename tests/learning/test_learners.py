@@ -156,6 +156,19 @@ def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learn
     np.testing.assert_allclose(metrics["return"], (3 * lasting + (16 - lasting)) / 16, rtol=1e-6)
 
 
+def test_statistics_forget_what_is_older_than_their_window_of_trajectories_and_are_frozen_in_the_end():
+    config = types.SimpleNamespace(obs_stats_window=0.5, obs_stats_freeze=0.4, updates=10)
+    obs, ended = jnp.ones((3, 4, 2, 1)), jnp.asarray(np.arange(4)[:, None] * np.ones((3, 1, 2)) > 2)
+    trajectory = types.SimpleNamespace(obs=obs, was_done=ended)
+    before = RunningStatistics(jnp.zeros(1), jnp.ones(1), jnp.asarray(100.0))
+    updated = jit_unoptimized(lambda step: collect.update_obs_stats(before, trajectory, config, step))
+    after, frozen = map(updated, (3, 4))
+    np.testing.assert_allclose(
+        [after.count, after.mean[0]], [12 + 18, 18 / 30]
+    )  # half of 24 steps, and those that count
+    np.testing.assert_array_equal([frozen.count, frozen.mean[0]], [100, 0])
+
+
 @pytest.fixture
 def three_worlds(monkeypatch):
     """Trajectory of worlds that go on, are truncated in step 0, and terminate in step 1; values are the observations.

@@ -5,6 +5,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones import envs
@@ -113,14 +114,13 @@ def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
     assert 0.9 < cosine < 1 - 1e-9
 
 
-@pytest.mark.slow
 def test_a_point_mass_is_pushed_by_thrust_and_by_turning_the_thrust_and_its_attitude_has_no_gradient():
     dt, response = 0.02, 0.1
     params = jd.repeat(jd.load_params("cf2x"), 1)
     hover = jnp.full((1, 4), params.hover_rpm[0])
     state = jd.State.at_rest(jnp.zeros((1, 3))).replace(rpm=hover)
     derivatives = jax.jacrev(lambda state, rpm: point_mass(dt, response)(params, state, rpm), (0, 1))
-    after = jax.jit(derivatives)(state, hover)
+    after = jit_unoptimized(derivatives)(state, hover)
     (pos_of_state, pos_of_rpm), (vel_of_state, vel_of_rpm) = after.pos, after.vel
     thrust = 2 * params.kf[0] * hover[0]  # of each rotor per RPM
     np.testing.assert_allclose(vel_of_rpm[0, 2, 0], thrust / params.mass[0] * dt, rtol=1e-9)

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import shutil
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -16,6 +17,12 @@ from jaxdrones.training.run import Run
 from jaxdrones.training.trainer import Trainer
 
 pytestmark = pytest.mark.float32
+
+
+def test_control_steps_are_those_of_all_drones():
+    config, env = SimpleNamespace(worlds=3, horizon=5), SimpleNamespace(drones=7)
+    own = SimpleNamespace(trainer=SimpleNamespace(recipe=SimpleNamespace(config=config), env=env))
+    assert loop._Loop._steps.fget(own) == 3 * 5 * 7
 
 
 class Killed(BaseException):

@@ -1,5 +1,7 @@
 """The contract of sensors: one drone in the sensor, a team around it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,16 +58,16 @@ def measure(sensors, key=KEY, memories=None):
     return measure_sensors(sensors, key, PARAMS, STATE, rate, Scene(), memories)
 
 
-def test_every_drone_has_its_own_constants_memory_and_noise():
-    sensors = (altimeter(), odometer())
+def test_every_drone_and_sensor_has_its_own_constants_memory_and_noise():
+    sensors = (altimeter(), odometer(), dataclasses.replace(altimeter(), name="second"))
     memories, readings = measure(sensors)
     memories, readings = measure(sensors, memories=memories)
-    assert memories["altimeter"] is None and sorted(readings) == ["altimeter", "odometer"]
+    assert memories["altimeter"] is None and sorted(readings) == ["altimeter", "odometer", "second"]
     distance, count = readings["odometer"]
     np.testing.assert_allclose(distance, 2 * PARAMS.max_speed)
     assert count.tolist() == [2, 2]
-    noise = readings["altimeter"] - STATE.pos[:, 2]
-    assert noise.shape == (2,) and abs(noise[0] - noise[1]) > 1e-6  # m, beyond rounding
+    noise = np.stack([readings[name] - STATE.pos[:, 2] for name in ("altimeter", "second")])
+    assert noise.shape == (2, 2) and np.diff(np.sort(noise, axis=None)).min() > 1e-6  # m, beyond rounding
 
 
 def test_equal_keys_give_equal_readings_and_a_further_sensor_changes_none():

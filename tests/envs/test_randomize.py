@@ -152,10 +152,10 @@ def test_before_the_first_destination_arrives_a_drone_holds_its_place():
     world = env.reset(KEY)[1]
     world = world.replace(drones=jd.State.at_rest(pos))
     moved = []
-    for _ in range(4):
+    for _ in range(3):
         world = env.step(KEY, world, jnp.full((2, 3), -1.0))[1]
         moved.append(float(jnp.max(jnp.abs(world.drones.pos - pos))))
-    assert max(moved[:2]) < 1e-12 < 1e-4 < moved[3]
+    assert max(moved[:2]) < 1e-12 < 1e-6 < moved[2]
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from helpers import jit_unoptimized, mostly_slow_rows
 from scipy.spatial.transform import Rotation
 
 import jaxdrones as jd
-from jaxdrones.envs import OBSERVATIONS, TASKS, make
+from jaxdrones.envs import OBSERVATIONS, TASKS, Env, make
 from jaxdrones.envs.observations import deviations
 from jaxdrones.tasks import ObservationTerm, World
 
@@ -36,6 +37,9 @@ def test_a_privileged_critic_is_given_relative_deviations_of_what_is_drawn():
     drawn = TEAM.replace(mass=TEAM.mass * jnp.array([1.1, 0.8]), kf=2 * TEAM.kf)
     chosen = [x is TEAM.mass for x in jax.tree.leaves(TEAM)]
     np.testing.assert_allclose(deviations(drawn, TEAM, chosen), [[0.1], [-0.2]], rtol=1e-9)
+    env = SimpleNamespace(terms=(OBSERVATIONS["position"],), task=None, params=TEAM, _drawn=chosen)
+    world = SimpleNamespace(params=drawn, drones=SimpleNamespace(pos=jnp.zeros((2, 3))))
+    np.testing.assert_allclose(Env.privileged_observation(env, world).params, [[0.1], [-0.2]], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

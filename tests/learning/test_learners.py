@@ -14,7 +14,7 @@ from helpers import jit_unoptimized, mostly_slow
 from jaxdrones import envs
 from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.envs.randomize import scaled
-from jaxdrones.learning import bptt, collect, ppo, shac
+from jaxdrones.learning import bptt, collect, critic, ppo, shac
 from jaxdrones.learning.critic import critic_observation
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import MLP, Policy
@@ -167,6 +167,12 @@ def test_statistics_forget_what_is_older_than_their_window_of_trajectories_and_a
         [after.count, after.mean[0]], [12 + 18, 18 / 30]
     )  # half of 24 steps, and those that count
     np.testing.assert_array_equal([frozen.count, frozen.mean[0]], [100, 0])
+
+
+def test_the_network_of_a_critic_has_outputs_of_the_size_of_a_reward(monkeypatch):
+    monkeypatch.setattr(critic, "apply", lambda *_: (None, jnp.full((2, 3, 1), 4.0)))
+    value = critic.discounted_value(ppo.Config(gamma=0.75), None, jnp.zeros((2, 3, 5)))
+    np.testing.assert_array_equal(value, np.full((2, 3), 16.0))
 
 
 @pytest.fixture

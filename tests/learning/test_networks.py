@@ -59,6 +59,11 @@ def test_the_central_critic_of_the_paper_sees_25_numbers_its_own_first():
     np.testing.assert_array_equal(seen[1], [*range(12, 24), *range(12), 100])
 
 
+def test_the_actions_of_a_central_critic_are_in_the_order_of_its_observations():
+    seen = centralized_input(jnp.arange(3.0)[:, None], 10 + jnp.arange(3.0)[:, None])
+    np.testing.assert_array_equal(seen, [[0, 1, 2, 11, 12], [1, 2, 0, 12, 10], [2, 0, 1, 10, 11]])
+
+
 @pytest.mark.slow
 def test_a_layer_of_the_cnn_is_a_convolution():
     cnn, picture = CNN(channels=(5,), strides=(4,), features=7), jax.random.normal(jax.random.key(1), (2, 8, 12, 3))

@@ -96,6 +96,12 @@ def test_a_gradient_that_is_not_finite_is_replaced_by_zero_and_counted():
     np.testing.assert_array_equal(count_nonfinite(jnp.array([[1.0, jnp.nan], [jnp.inf, 0.0]])), 2)
 
 
+def test_only_a_gradient_longer_than_the_limit_is_shortened():
+    clip = jax.jit(lambda x: clip_gradient(0.5).update({"x": x}, None)[0]["x"])
+    np.testing.assert_allclose(clip(jnp.array([0.3, 0.4])), [0.3, 0.4])
+    np.testing.assert_allclose(clip(jnp.array([3.0, 4.0])), [0.3, 0.4])
+
+
 def test_the_learning_rate_follows_the_divergence_within_bounds_that_are_annealed():
     config = ppo.Config(updates=100, target_kl=0.02, max_learning_rate=6e-3, anneal_fraction=0.4)
 

@@ -21,8 +21,8 @@ KEY = jax.random.key(0)
 REACH = 1.2
 
 
-def encoded(own, rows):
-    encoder = SetEncoder((8, 4), REACH)
+def encoded(own, rows, reach=REACH):
+    encoder = SetEncoder((8, 4), reach)
     params, apply = jit_unoptimized(encoder.init)(KEY, own, rows), jit_unoptimized(encoder.apply)
     return lambda own, rows: np.asarray(apply(params, own, rows))
 
@@ -42,12 +42,10 @@ def test_the_features_of_a_set_depend_on_neither_order_nor_far_rows():
 
 def test_a_row_fades_out_without_a_jump():
     own, rows = np.ones(2), np.ones((1, 5))
-    features = encoded(own, rows)
-
-    def size(away):
-        return np.linalg.norm(features(own, np.array([[away, 0.0, 0.0, 1.0, 1.0]])))
-
-    assert size(REACH) < 1e-5 < size(0.99 * REACH) < 0.05 * size(0.3 * REACH)
+    faded, full = (encoded(own, rows, reach) for reach in (REACH, 1e9))
+    for share, weight in (0.3, 1.0), (1 / 3, 1.0), (2 / 3, 0.5), (0.99, 0.015), (1.0, 0.0):
+        row = np.array([[share * REACH, 0.0, 0.0, 1.0, 1.0]])
+        np.testing.assert_allclose(faded(own, row), weight * full(own, row), atol=1e-6)
 
 
 def test_a_drone_beyond_a_reach_is_not_seen_and_a_reach_that_networks_do_not_see_is_refused():

@@ -180,6 +180,13 @@ def test_the_nearest_are_those_of_a_sorted_search(count):
     np.testing.assert_allclose(np.sort(seen, axis=1), np.take_along_axis(away, expected, axis=1), rtol=1e-6)
 
 
+def test_the_closest_approach_is_looked_for_until_the_horizon():
+    pos, vel = ([jnp.array([[x]]) for x in v] for v in ((6.0, 0.3, 0.0), (-2.0, 0.0, 0.0)))
+    for horizon, time in (4.0, 12 / 4.05), (1.5, 1.5):  # as 0.05 m^2/s^2 are added to the squared speed
+        found, (x, y, z) = closest_approach(pos, vel, horizon)
+        np.testing.assert_allclose([found, x, y, z], np.reshape([time, 6 - 2 * time, 0.3, 0], (4, 1, 1)))
+
+
 def test_the_gradient_of_the_closest_approach_is_finite_for_drones_at_rest_and_at_one_place():
     def of(p, v):
         return jnp.sum(jnp.stack(closest_approach(*(list(x[:, None, None]) for x in (p, v)), 1.5)[1]))

@@ -36,6 +36,13 @@ def test_a_drone_is_in_view_where_the_camera_shows_it():
     assert ENV().task.metrics["in_view"](ENV().task, world_with((-2, 0, 0), yaw=np.pi))[1] == 1
 
 
+def test_what_is_out_of_sight_costs_one_minus_the_cosine_from_the_axis_of_the_camera():
+    scale, cost = ENV().task.rewards["view"]
+    for offset, expected in ((2, 0, 0), 0), ((0, 2, 0), 1), ((-2, 0, 0), 2), ((1, 0, 1), 1 - 0.5**0.5):
+        np.testing.assert_allclose(cost(ENV().task, world_with(offset)), [0, expected, 0], atol=1e-6)
+    assert scale < 0
+
+
 def test_a_follower_should_be_at_its_distance_on_the_level_line_to_the_drone_before_it():
     world = world_with((4.0, 0.0, 1.0))
     np.testing.assert_allclose(ENV().task.target_now(world).pos[1:], [[3.5, 2, 4], [-0.5, 2, 3]], atol=1e-12)

@@ -123,6 +123,14 @@ def test_the_centerline_passes_the_gates_in_order_and_in_their_direction():
         assert passes(jnp.asarray(gate)[None], jnp.asarray(before)[None], jnp.asarray(beyond)[None])[0]
 
 
+@pytest.mark.parametrize(("y", "counts"), [(0.0, True), (0.19, True), (0.21, False), (-0.3, False)])
+def test_a_gate_is_passed_where_the_way_crosses_its_plane(y, counts):
+    """Obliquely, 0.5 m to both sides of the plane in x and in y."""
+    before, beyond = (jnp.array([[way, y + way, 0.1]]) for way in (-0.5, 0.5))
+    assert passes(jnp.zeros((1, 4)), before, beyond).tolist() == [counts]
+    assert passes(jnp.zeros((1, 4)), beyond, before).tolist() == [False]
+
+
 def test_the_centerline_between_gates_on_a_circle_is_nearly_the_circle():
     angle = np.arange(4) * np.pi / 2
     gates = np.stack([np.cos(angle), np.sin(angle), np.ones(4), angle + np.pi / 2], axis=-1)

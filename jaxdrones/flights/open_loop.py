@@ -164,7 +164,7 @@ def _rotor_speed(
         measured = command[_WARM_UP:]
         middle, early, late = (_shifted(measured, delay - later)[:_LENGTH] for later in (_HALF_ROW, 0, 1))
         return middle, (late - early) / PERIOD
-    delayed = _shifted(command, delay)
+    delayed = _shifted(command, delay - _HALF_ROW)
     duty, battery, sag = delayed[:, :4], delayed[:, 4:5], delayed[:, 5:]
     thrust = motors.thrust(duty * vehicle.instruments.motor_supply(battery, sag))
 

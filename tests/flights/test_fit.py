@@ -101,6 +101,16 @@ def test_measured_speeds_are_those_at_the_times_of_the_rows():
     np.testing.assert_allclose(rate, 7 / 0.01, rtol=1e-4)
 
 
+def test_rotors_follow_the_pwm_between_the_rows():
+    """A PWM that is recorded while it rises is on average that of half a row later; the lag delays it by five rows."""
+    params = jaxdrones.load_params("cf2x").replace(rotor_rise_time=jnp.asarray(0.05))
+    motors = crazyflie_motors().replace(coefficients=jnp.array([0, 0, params.kf, 0]))  # the speed is the voltage
+    rows = jnp.arange(93.0)
+    command = jnp.stack([*[7 * rows] * 4, jnp.ones(93), jnp.zeros(93)], axis=1)
+    speed, _ = _rotor_speed(Vehicle.of(params), command, motors)
+    np.testing.assert_allclose(speed[:, 0], 7 * (36.5 - 5 + np.arange(50)), atol=7 * 0.03)
+
+
 @pytest.mark.parametrize("delay", [-7.0, -0.5, 0.0, 5.8, 6.5, 20.0])
 def test_constant_rotor_speeds_have_no_delay(delay):
     """Beyond the six rows of margin the delay is limited: the rotors do not slow down or stop."""

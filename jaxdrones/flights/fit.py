@@ -42,7 +42,7 @@ class Estimate:
     value: float
     """Estimated value, SI units."""
     std_error: float
-    """Standard error from the Gauss-Newton matrix, which assumes independent residuals, SI units."""
+    """Standard error, SI units, with residuals that are correlated over a second; without errors of the model."""
     identifiable: bool
     """Whether the parameter is identified: zero is at least two standard errors away.
 
@@ -179,6 +179,7 @@ class _Problem:
     def normal(self, x: np.ndarray, scales: list[np.ndarray]) -> Normal:
         """Normal equations of all flights with the prior, and robust scales of each flight's residuals."""
         matrix, gradient, robust = np.diag(self.prior), self.prior * x, []
+        spread = np.zeros_like(matrix)
         loss = float(self.prior @ x**2)
         coordinates = [self.indices(i) for i in range(len(self.flights))]
         with ThreadPoolExecutor(os.cpu_count()) as pool:  # a program of one flight keeps one core busy
@@ -186,10 +187,11 @@ class _Problem:
             parts = pool.map(own, (x[i] for i in coordinates), scales, self.windows, self.masks)
         for i, part in zip(coordinates, parts, strict=True):
             matrix[np.ix_(i, i)] += part.matrix
+            spread[np.ix_(i, i)] += part.spread
             gradient[i] += part.gradient
             loss += float(part.loss)
             robust.append(part.scale)
-        return Normal(matrix, gradient, loss, np.stack(robust))
+        return Normal(matrix, gradient, loss, np.stack(robust), spread)
 
     def vehicle(self, x: np.ndarray) -> Vehicle:
         """Vehicle with the shared parameters and the medians of the per-flight parameters."""
@@ -237,7 +239,7 @@ class _Problem:
         self, x: np.ndarray, normal: Normal, losses: tuple[float, ...], validate: Sequence[FlightLog], named: bool
     ) -> Report:
         information = normal.matrix - (1 - _PRIOR_REMAINDER) * np.diag(self.prior)  # of the flights, not of the prior
-        vehicle, errors = self.vehicle(x), standard_errors(information)
+        vehicle, errors = self.vehicle(x), standard_errors(information, normal.spread)
         shared = errors[: len(self.shared)]
         per_flight = errors[len(self.shared) :].reshape(len(self.flights), len(self.per_flight))
         by_name = np.concatenate([shared, np.sqrt(np.sum(per_flight**2, axis=0)) / len(self.flights)])

@@ -17,6 +17,7 @@ from jaxdrones.flights.vehicle import Vehicle
 _CAUCHY_SCALE_SQUARED = 1.0  # c^2 of the Cauchy loss n c^2 log(1 + s / c^2); s is the mean of a window's n squares
 _INITIAL_DAMPING = 1e-3  # fraction of the diagonal
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
+_CORRELATED_WINDOWS = 4  # following windows with correlated residuals: one second
 
 
 class Normal(NamedTuple):
@@ -30,6 +31,8 @@ class Normal(NamedTuple):
     """() robust sum of squares."""
     scale: Any = np.ones(())
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
+    spread: Any = 0.0
+    """(n, n) covariance of the gradient."""
 
 
 def levenberg_marquardt(
@@ -86,16 +89,26 @@ def normal_equations(
 
     jacobian, weight, r, loss = jax.vmap(of_window)(windows, mask)
     matrix = jnp.einsum("pik,pjk,p->ij", jacobian, jacobian, weight)
-    gradient = jnp.einsum("pik,pk,p->i", jacobian, r, weight)
+    gradients = jnp.einsum("pik,pk,p->pi", jacobian, r, weight)
     squares = jnp.where(mask[:, None] > 0, r * r, jnp.nan)
     median = jnp.nanmedian(squares, axis=0).reshape(len(HORIZONS), 4, 3)
-    return Normal(matrix, gradient, jnp.sum(loss), scale * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE))
+    robust = scale * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE)
+    return Normal(matrix, jnp.sum(gradients, axis=0), jnp.sum(loss), robust, spread(gradients, _CORRELATED_WINDOWS))
 
 
-def standard_errors(information: np.ndarray) -> np.ndarray:
-    """Standard errors of parameters from their information matrix (n, n), the inverse of the covariance.
+def spread(gradients: Float[Array, "k n"], lags: int) -> Float[Array, "n n"]:
+    """Covariance of the sum of k successive gradients that are correlated over some lags (Newey and West 1987)."""
+    k = len(gradients)
+    lagged = [(1 - i / (lags + 1)) * gradients[i:].T @ gradients[: k - i] for i in range(min(lags + 1, k))]
+    return lagged[0] + sum(x + x.T for x in lagged[1:])
 
-    They are infinite where rounding leaves no positive variance, as the matrix is nearly singular.
+
+def standard_errors(information: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Standard errors of parameters from their information matrix (n, n) and the covariance of their gradient (n, n).
+
+    They are the larger ones of those for independent and for correlated residuals, and infinite where rounding leaves
+    no positive variance, as the matrix is nearly singular.
     """
-    variance = np.diag(np.linalg.inv(information))
-    return np.sqrt(np.where(variance > 0, variance, np.inf))
+    inverse = np.linalg.inv(information)
+    variance = np.diag(inverse)
+    return np.sqrt(np.where(variance > 0, np.maximum(variance, np.diag(inverse @ spread @ inverse)), np.inf))

@@ -13,7 +13,7 @@ from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.flights import closed_loop
-from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, standard_errors
+from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, spread, standard_errors
 from jaxdrones.flights.log import PERIOD, FlightLog
 from jaxdrones.flights.parameters import with_parameters
 from jaxdrones.flights.vehicle import Vehicle
@@ -29,6 +29,8 @@ _PATH_STD = 0.05  # m, standard deviation of the horizontal position along an ax
 _STRIDE = 20  # rows between the compared points of a path
 _CAUCHY_SCALE_SQUARED = 9.0  # c^2 of the Cauchy loss c^2 log(1 + r^2 / c^2)
 _PRIOR_PRECISION = 1.0  # inverse variance of x
+_PRIOR_REMAINDER = 1e-3  # fraction of the prior in the information matrix, which keeps it invertible
+_CORRELATED = 20  # following residuals with correlated errors: 2 s of a path, 20 s of the balance
 _MAX_STEPS = 8
 _MIN_DECREASE = 1e-3  # relative decrease of the loss at which to stop
 
@@ -145,10 +147,12 @@ def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float
         robust = r * r if np.isinf(cauchy_scale_squared) else cauchy_scale_squared * jnp.log1p(relative)
         loss = jnp.sum(robust) + _PRIOR_PRECISION * x @ x
         matrix = weighted @ jacobian.T + _PRIOR_PRECISION * jnp.eye(count)
-        return Normal(matrix, weighted @ r + _PRIOR_PRECISION * x, loss)
+        gradients = spread((weighted * r[None]).T, _CORRELATED)
+        return Normal(matrix, weighted @ r + _PRIOR_PRECISION * x, loss, spread=gradients)
 
     x, last = levenberg_marquardt(normal, np.zeros(count), _MAX_STEPS, _MIN_DECREASE)
-    return jnp.asarray(x, float), standard_errors(last.matrix)
+    information = last.matrix - (1 - _PRIOR_REMAINDER) * _PRIOR_PRECISION * np.eye(count)
+    return jnp.asarray(x, float), standard_errors(information, last.spread)
 
 
 def _rms(x: Array) -> float:

@@ -30,10 +30,10 @@ from jaxdrones.flights import (
     open_loop_errors,
 )
 from jaxdrones.flights.fit import Estimate, Report, _estimate, _Problem
-from jaxdrones.flights.least_squares import standard_errors
+from jaxdrones.flights.least_squares import spread, standard_errors
 from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
 from jaxdrones.flights.parameters import check_guess
-from jaxdrones.flights.path_fit import _balance_residuals
+from jaxdrones.flights.path_fit import _balance_residuals, _least_squares
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
 from jaxdrones.urdf import parse_params
@@ -308,8 +308,38 @@ def test_a_fit_is_written_without_matplotlib_and_never_over_another(
 
 def test_a_parameter_without_a_positive_variance_has_an_infinite_standard_error():
     """The inverse of a nearly singular matrix is rounded below zero: its second parameter has no information."""
-    errors = standard_errors(np.diag([4.0, -1e-20]))
+    errors = standard_errors(np.diag([4.0, -1e-20]), np.diag([4.0, 0]))
     np.testing.assert_array_equal(errors, [0.5, np.inf])
+
+
+def test_standard_errors_of_a_path_fit_are_those_of_the_flights_not_of_the_prior():
+    """A parameter without effect had a standard error of 1, its prior's, and was called identifiable."""
+    noise = np.repeat(np.random.default_rng(4).normal(size=500), 5)  # 500 values, not 2500
+    _, errors = _least_squares(lambda x: (x[0] - 2) + noise + 0 * x[1], 2, np.inf)
+    assert errors[1] > 10
+    assert errors[0] == pytest.approx(500**-0.5, rel=0.05)
+
+
+def test_residuals_that_repeat_increase_the_standard_error():
+    """If each value comes three times, the mean of n values has the variance of n / 3; here less a tapered share."""
+    values = np.repeat(np.random.default_rng(0).normal(size=(20000, 1)), 3, axis=0)
+    information = np.array([[float(len(values))]])
+    expected = 1 + 2 * (4 / 5 * 2 / 3 + 3 / 5 * 1 / 3)
+    error = standard_errors(information, np.asarray(spread(values, 4)))
+    np.testing.assert_allclose(error**2 * len(values), expected, rtol=0.03)
+    np.testing.assert_allclose(standard_errors(information, 0 * information) ** 2 * len(values), 1)
+
+
+def test_the_errors_of_a_fit_have_the_spread_of_its_gradient(problem_of):
+    """The gradients of two flights are independent, and four times their variance doubles the standard errors."""
+    names, scales = ("drag_coeff_x", "trim_torque_x"), [np.full((3, 4), 0.1)] * 2
+    one, two = (problem_of(n, names).normal(np.array([0.2, *[-0.3] * n]), scales[:n]) for n in (1, 2))
+    assert two.spread[0, 0] == pytest.approx(2 * one.spread[0, 0]) and one.spread[0, 0] > 0
+    problem, information = problem_of(1, names), one.matrix - 0.999 * np.diag([0.01, 0.01])
+    normals = (one._replace(spread=k * information) for k in (0, 4))
+    first, second = (problem._report(np.zeros(2), normal, (), (), False).parameters for normal in normals)
+    for name in names:
+        assert second[name].std_error == pytest.approx(2 * first[name].std_error)
 
 
 @pytest.mark.parametrize("text", ["a---b", "--", "ends with -", "-->", 'quo"te & <tag>', "bell \x07 \x00"])

@@ -72,4 +72,4 @@ def _noisy(
     def measure(key: jax.Array, params: Params, state: State, rate_: State, scene: Scene, memory: Errors):
         return errors.measure(key, memory, true(state), 1 / rate)
 
-    return Sensor(name, measure, init, bound=errors.limit, rate=rate, entries=entries, clocked=True)
+    return Sensor(name, measure, init, bound=errors.limit, rate=rate, entries=entries, clocked=rate)

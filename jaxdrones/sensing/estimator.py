@@ -165,7 +165,7 @@ def state_estimate(
         *quantities("body rates estimated", "rad/s", "body"),
         *quantities("rotors", "RPM", parts=("speed of rotor 0", "1", "2", "3")),
     )
-    return Sensor(name, measure, init, rate=rate, entries=entries, clocked=True)
+    return Sensor(name, measure, init, rate=rate, entries=entries, clocked=rate)
 
 
 def seen(now: kalman.Estimate, state: State, read: dict[str, Array], true: dict[str, Array]) -> State:

@@ -73,7 +73,7 @@ def imu(
 
     entries = (*quantities("specific force", "m/s^2", "body"), *quantities("body rates measured", "rad/s", "body"))
     bound = max(part.acc.limit, part.gyro.limit)
-    return Sensor(name, measure, functools.partial(begin, part), bound=bound, rate=rate, entries=entries, clocked=True)
+    return Sensor(name, measure, functools.partial(begin, part), bound=bound, rate=rate, entries=entries, clocked=rate)
 
 
 def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:

@@ -102,4 +102,4 @@ def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capt
         *quantities("position measured", "m", "world"),
         *quantities("attitude measured (quaternion, body to world)", parts="xyzw"),
     )
-    return Sensor(name, measure, init, rate=system.rate, entries=entries, clocked=True)
+    return Sensor(name, measure, init, rate=system.rate, entries=entries, clocked=system.rate)

@@ -59,9 +59,9 @@ class Sensor:
     control step."""
     entries: tuple[Quantity, ...] = ()
     """Description of each entry of the flattened reading, for `jaxdrones.explain`; optional."""
-    clocked: bool = False
-    """Whether the sensor requires exactly 1 / `rate` between measurements, for example because it integrates. An
-    environment then rejects a rate that does not divide its control rate."""
+    clocked: float | None = None
+    """Rate, equal to `rate`, of a sensor whose `measure` requires exactly this one, for example because it integrates.
+    An environment then rejects a rate that does not divide its control rate."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -73,8 +73,11 @@ class Sensor:
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
             check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)
-        if self.clocked and self.rate is None:
-            raise UserError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
+        if self.clocked not in (None, self.rate):
+            raise UserError(
+                f"sensor {self.name!r} is clocked at {self.clocked} Hz, but its rate is {self.rate}; make a new sensor "
+                "with this rate, for example imu(rate=50)"
+            )
 
     def is_due(self, step: jax.Array, dt: float) -> jax.Array:
         """Whether there is a measurement at a control step.

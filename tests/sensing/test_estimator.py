@@ -287,7 +287,9 @@ def test_an_estimate_has_a_gradient_through_the_flight(flown):
             "sensor 'imu' measures at 500 Hz, which does not divide",
         ),
         (lambda: jd.make("hover", sensors=(imu(rate=30.0),)), "30 Hz, which does not divide the 100 Hz of the control"),
-        (lambda: jd.Sensor("x", imu().measure, clocked=True), "sensor 'x' is clocked, but has no rate"),
+        (lambda: jd.Sensor("x", imu().measure, clocked=50.0), "sensor 'x' is clocked at 50.0 Hz, but its rate is None"),
+        (lambda: dataclasses.replace(imu(), rate=50.0), "'imu' is clocked at 100.0 Hz, but its rate is 50.0;"),
+        (lambda: dataclasses.replace(barometer(), rate=100), "'barometer' is clocked at 50.0 Hz, but its rate is 100;"),
     ],
 )
 def test_nonsense_is_refused(make, message):

@@ -123,8 +123,8 @@ def make_step(
         rpm (n, 4) the commanded rotor speeds, which the rotors limit to [0, `params.max_rpm`]. There is no floor:
         drones fall through z = 0 without `ground_contact` in `effects`, and pass through each other without
         `drone_contact` in `pairs`. The step raises `ValueError` on a wrong shape, and with concrete arguments on
-        constants that cannot fly, on rotors that lag by less than half of `dt`, and on quaternions that are not of unit
-        length.
+        constants that cannot fly, on a wind or an external force on which no effect depends, on rotors that lag by less
+        than half of `dt`, and on quaternions that are not of unit length.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
@@ -194,14 +194,17 @@ class ExplicitStep(Step):
 
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Advance a team by one control step; see `make_step`."""
-        if params is not self._params or state.quat is not self._quat:
+        given, is_new = self._given(scene), params is not self._params or state.quat is not self._quat
+        if is_new:
             check_params(params, finite=False)
             self.check_lag(params)
             check_quaternion("state.quat", state.quat)
-        state = self._step(params, state, rpm, self._given(scene))
-        if not is_traced(state.quat):
-            self._params, self._quat = params, state.quat
-        return state
+        after = self._step(params, state, rpm, given)
+        if is_new:
+            self.physics.check_acts(params, state, given)
+        if not is_traced(after.quat):
+            self._params, self._quat = params, after.quat
+        return after
 
     def check_lag(self, params: Params) -> None:
         """Raise for rotors whose lag is too short for the physics step."""

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, sequence
 from jaxdrones.checks import bind, check_function, is_concrete, takes
 from jaxdrones.dynamics.model import Model
@@ -150,6 +151,33 @@ class Physics:
                 f"the physics step is {dt:.4g} s and rotors that lag by {largest / 2:.2g} s are stable up to "
                 f"{largest:.2g} s; give a shorter dt or more substeps, or rotors without a lag"
             )
+
+    @functools.cached_property
+    def _acting(self) -> set[str]:
+        """Fields of wind and force on which the loads are known to depend."""
+        return set()
+
+    def check_acts(
+        self, params: Params, state: State, scene: Scene, is_random: Callable[[str], Any] = lambda field: False
+    ) -> None:
+        """Raise for a wind or external force of a team, constant or random, on which no effect depends.
+
+        Traced values that are not random pass; the scene may have shapes in place of arrays.
+        """
+        for field, example in ("wind", "drag"), ("external_force", "external_force"):
+            value, random = getattr(params, field), bool(is_random(field))
+            if field in self._acting or not (random or (is_concrete(value) and np.any(np.asarray(value)))):
+                continue
+
+            def loads(x: Array, scene: Scene, field: str = field) -> Loads:
+                return self.loads(params.replace(**{field: x}), state, state.rpm, self.seen(scene))
+
+            if not any(jax.tree.leaves(compiler.depends(loads, value, scene))):
+                raise UserError(
+                    f"there is a {'random' if random else 'constant'} {field}, and no effect depends on it; give an "
+                    f"effect that does, for example effects=({example!r},), or leave out the {field}"
+                )
+            self._acting.add(field)
 
     @functools.cached_property
     def takes_scene(self) -> bool:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, number
-from jaxdrones.engine.physics import Loads, Physics
+from jaxdrones.engine.physics import Physics
 from jaxdrones.envs.randomize import Randomization
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -70,12 +70,11 @@ class DisturbanceWithMemory:
 
 
 def check_loads(physics: Physics, params: Params, scene: Scene, drawn: Params, disturbance: Disturbance | None) -> None:
-    """Raise for a random wind or force on which no effect, rotor or model of the physics depends.
+    """Raise for a wind or force, constant or random, on which no effect, rotor or model of the physics depends.
 
     `params` are those of a team, `scene` may have shapes in place of arrays, and `drawn` is a mask of the parameters
     that are random in every episode.
     """
-    zeros = jnp.zeros_like(params.wind, shape=(len(params.mass), 4))
 
     def is_random(field: str) -> bool:
         def value(key: jax.Array) -> Array:
@@ -83,20 +82,8 @@ def check_loads(physics: Physics, params: Params, scene: Scene, drawn: Params, d
 
         return getattr(drawn, field) or compiler.depends(value, jax.random.key(0))
 
-    def acts(field: str) -> bool:
-        state = physics.init(params, State.at_rest(jnp.zeros_like(params.wind)))
-
-        def loads(x: Array, scene: Scene) -> Loads:
-            return physics.loads(params.replace(**{field: x}), state, zeros, physics.seen(scene))
-
-        return any(jax.tree.leaves(compiler.depends(loads, getattr(params, field), scene)))
-
-    for field, example in ("wind", "drag"), ("external_force", "external_force"):
-        if is_random(field) and not acts(field):
-            raise UserError(
-                f"there is a random {field}, and no effect depends on it; give an effect that does, for example "
-                f"effects=({example!r},), or leave out the {field}"
-            )
+    state = physics.init(params, State.at_rest(jnp.zeros_like(params.wind)))
+    physics.check_acts(params, state, scene, is_random)
 
 
 @checked

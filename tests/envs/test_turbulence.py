@@ -17,6 +17,7 @@ from jaxdrones.envs.randomize import constant_wind, scaled, shifted
 from jaxdrones.sensing import Scene, Sphere
 
 KEY = jax.random.key(0)
+CF2X = jd.load_params("cf2x")
 AXES = "uvw"
 MEAN = np.array([3.0, 4.0, 0.0])
 DRONES = 64
@@ -173,6 +174,17 @@ def test_a_random_force_without_an_effect_of_it_is_refused():
     with pytest.raises(ValueError, match=message):
         env.reset(jax.random.key(0))
     make("hover", disturbance=random_pushes(0.3))
+
+
+def test_a_constant_wind_or_force_without_an_effect_of_it_is_refused():
+    """It was ignored without a word, by a step and by an environment."""
+    windy, pushed = (CF2X.replace(**{field: jnp.ones(3)}) for field in ("wind", "external_force"))
+    step, team = jd.make_step(effects=(jd.external_force,)), jd.repeat(windy, 1)
+    with pytest.raises(ValueError, match="there is a constant wind, and no effect depends on it; give an effect"):
+        jax.eval_shape(lambda rpm: step(team, jd.State.at_rest(jnp.zeros((1, 3))), rpm), jnp.zeros((1, 4)))
+    with pytest.raises(ValueError, match="there is a constant external_force, and no effect depends on it"):
+        make("hover", vehicle=pushed, effects=("drag",))
+    make("hover", vehicle=windy, effects=("drag",))
 
 
 def gusty_rotors(params, state, command):

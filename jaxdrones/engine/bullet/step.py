@@ -177,6 +177,7 @@ class BulletStep(HostStep):
             check_team(params, state, rpm)
             check_params(params)
             self.physics.check_lag(params, self.dt)
+            self.physics.check_acts(params, state, self.scene)
             self._layout, self._flat_params = Layout.of(params), pack(params, n)
             self.client.set_team(np.asarray(arrays.bodies_of(params), float))
             self._params, self._shapes = params, shapes

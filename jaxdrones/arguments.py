@@ -108,6 +108,7 @@ Fraction = Annotated[Scalar, number(at_least=0, at_most=1)]
 PositiveFraction = Annotated[Scalar, number(above=0, at_most=1)]
 BelowOne = Annotated[Scalar, number(at_least=0, below=1)]
 Seconds = Annotated[float, number("s", above=0)]
+TimeStep = Annotated[float, number("s", above=0, at_most=1)]
 Hertz = Annotated[float, number("1/s", above=0)]
 count, seed = whole(limit=LARGEST_COUNT), whole(minimum=0, limit=LARGEST_SEED)
 Count = Annotated[int, count]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import Seconds, checked
+from jaxdrones.arguments import TimeStep, checked
 from jaxdrones.control import firmware_loops as loops
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import Gains, Memory
@@ -139,7 +139,7 @@ def reset(memory: Memory) -> Memory:
 
 @checked
 def control(
-    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: AnySetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: AnySetpoint, *, dt: TimeStep
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
@@ -160,7 +160,7 @@ def pwm(
     setpoint: AnySetpoint,
     battery: Float[Array, ""] | float | None = None,
     *,
-    dt: Seconds = 0.002,
+    dt: TimeStep = 0.002,
 ) -> tuple[Memory, motors.Command]:
     """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 

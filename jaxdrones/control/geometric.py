@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Seconds, checked
+from jaxdrones.arguments import TimeStep, checked
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
@@ -42,7 +42,7 @@ def init() -> None:
 
 @checked
 def control(
-    gains: Finite[Gains], params: OneParams, memory: Any, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Any, state: OneState, setpoint: OneSetpoint, *, dt: TimeStep
 ) -> tuple[Any, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Seconds, checked
+from jaxdrones.arguments import TimeStep, checked
 from jaxdrones.control import attitude
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import degrees, low_pass, settled
@@ -115,7 +115,7 @@ def init() -> Memory:
 
 @checked
 def control(
-    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: TimeStep
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
@@ -133,7 +133,7 @@ def pwm(
     setpoint: OneSetpoint,
     battery: Float[Array, ""] | float | None = None,
     *,
-    dt: Seconds = 0.002,
+    dt: TimeStep = 0.002,
 ) -> tuple[Memory, motors.Command]:
     """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Seconds, checked
+from jaxdrones.arguments import TimeStep, checked
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.single import Finite, OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
@@ -65,7 +65,7 @@ def init() -> Memory:
 
 @checked
 def control(
-    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: Seconds
+    gains: Finite[Gains], params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: TimeStep
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm` (unlimited in gym-pybullet-drones).
 

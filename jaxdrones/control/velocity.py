@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Seconds, checked, shape
+from jaxdrones.arguments import TimeStep, checked, shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import Finite, OneParams, OneState
@@ -25,7 +25,7 @@ def control(
     state: OneState,
     action: Annotated[Float[Array, "4"], _OF_ONE],
     *,
-    dt: Seconds,
+    dt: TimeStep,
 ) -> tuple[pid.Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone by the PID, RPM; see `jaxdrones.control`.
 

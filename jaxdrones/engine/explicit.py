@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.apart import apart_under_vmap
 from jaxdrones.accelerate.shared import recomputed
-from jaxdrones.arguments import Count, Seconds, checked
+from jaxdrones.arguments import Count, TimeStep, checked
 from jaxdrones.checks import check_params, check_quaternion
 from jaxdrones.dynamics import INTEGRATORS
 from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
@@ -94,7 +94,7 @@ def make_step(
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
     integrator: Annotated[Integrator, check_function_of_step] = semi_implicit_euler,
-    dt: Seconds = 1 / 240,
+    dt: TimeStep = 1 / 240,
     substeps: Count = 1,
     *,
     team_effects: Sequence[TeamEffect] = (),
@@ -128,8 +128,8 @@ def make_step(
 
     Raises:
         ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
-            obstacles without an effect that uses it, or `dt` above that with which an effect is stable: 1/240 s for
-            contact, 1/100 s for `cable`.
+            obstacles without an effect that uses it, or `dt` above 1 s or above that with which an effect is stable:
+            1/240 s for contact, 1/100 s for `cable`.
     """
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     _check_stable(physics, dt, substeps)

@@ -168,7 +168,7 @@ def test_a_time_between_calls_that_is_not_positive_is_refused(loop):
     """Of all but that of body rates, which does not use it."""
     team, memory, state, target = in_flight(loop)
     arguments = (one(x, 0) for x in (team, memory, state, target))
-    with pytest.raises(ValueError, match=r"^dt is 0; give a positive number \(s\)$"):
+    with pytest.raises(ValueError, match=r"^dt is 0; give a number above 0 and at most 1 \(s\)$"):
         loop.control(loop.gains(), *arguments, dt=0)
 
 

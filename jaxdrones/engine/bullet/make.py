@@ -5,7 +5,7 @@ from typing import Annotated
 
 import jax
 
-from jaxdrones.arguments import Count, Seconds, checked, choice, number
+from jaxdrones.arguments import Count, TimeStep, checked, choice, number
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.bullet.client import BALLS, CYLINDER, EGL, TINY, Client
@@ -24,7 +24,7 @@ def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
-    dt: Seconds = 1 / 240,
+    dt: TimeStep = 1 / 240,
     substeps: Count = 1,
     *,
     team_effects: Sequence[TeamEffect] = (),

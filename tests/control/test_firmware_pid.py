@@ -12,7 +12,7 @@ from helpers import VEHICLES, assert_finite, jit_optimized, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
-from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team, mellinger
+from jaxdrones.control import Setpoint, firmware_loops, firmware_motors, firmware_pid, for_team, mellinger
 from jaxdrones.control.allocation import mixer
 from jaxdrones.thrust_curves import thrust_at, voltage_for
 
@@ -297,3 +297,27 @@ def test_an_attitude_that_was_followed_before_rates_is_not_integrated_after_them
     assert np.all(np.abs(memory.attitude_integral) > 0.01)
     memory = fly(memory, firmware_pid.Rates(omega=jnp.zeros(3), thrust=thrust))
     np.testing.assert_array_equal(memory.attitude_integral, 0)
+
+
+def test_integrators_of_rates_and_attitude_are_limited():
+    """By the firmware's 33.3 and 166.7 degrees, and 20 and 360 degrees s, times the gains; torques are right-handed."""
+    gains, wound = firmware_pid.gains(), jnp.full(3, 1e9)
+    memory = firmware_pid.init().replace(rate_integral=wound, attitude_integral=wound)
+    _, torque = firmware_loops.rate_loop(gains, memory, LEVEL, jnp.zeros(3), DT)
+    _, rates = firmware_loops.attitude_loop(gains, memory, LEVEL, jnp.zeros(3), DT)
+    np.testing.assert_allclose(torque, [500 * 33.3, -500 * 33.3, 16.7 * 166.7])
+    np.testing.assert_allclose(rates, [3 * 20, 3 * 20, 360])
+
+
+def test_a_heading_that_crosses_half_a_turn_has_no_kick():
+    """The derivative of yaw is that of the turn, from 179 to -179 degrees as from -1 to 1 degree."""
+    targets = []
+    for start, end in ((179.0, -179.0), (-1.0, 1.0)):
+        memory = firmware_pid.init().replace(rpy=jnp.array([0, 0, start]))
+        quat = rotation.from_rpy(jnp.deg2rad(jnp.array([0, 0, end])))
+        attitude = jnp.array([0, 0, end])
+        targets.append(
+            firmware_loops.attitude_loop(firmware_pid.gains(), memory, LEVEL.replace(quat=quat), attitude, DT)[1]
+        )
+    np.testing.assert_allclose(targets[0], [0, 0, -0.35 * 2 / DT], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(targets[0], targets[1], rtol=1e-9, atol=1e-9)

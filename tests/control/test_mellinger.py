@@ -74,8 +74,11 @@ def test_it_follows_what_the_pid_trails():
     assert 0.3 < off(firmware_pid) < 0.45  # 0.8 m/s times 0.5 s
 
 
-def test_without_an_error_it_commands_the_weight_that_it_believes():
-    _, command = mellinger.pwm(mellinger.gains(), mellinger.init(), LEVEL, Setpoint.at(LEVEL.pos))
+@pytest.mark.parametrize("vehicle", [None, "hb"])
+def test_without_an_error_it_commands_the_weight_that_it_believes(vehicle):
+    """For a scaled vehicle, too, it is the command of a Crazyflie, as full command is a scaled thrust."""
+    gains = mellinger.gains(vehicle and jaxdrones.load_params(vehicle))
+    _, command = mellinger.pwm(gains, mellinger.init(), LEVEL, Setpoint.at(LEVEL.pos))
     np.testing.assert_allclose(command.pwm, 132000 * 0.029 * 9.81, rtol=1e-12)
     np.testing.assert_allclose(command.attitude, 0, atol=1e-12)
 
@@ -84,3 +87,12 @@ def test_a_target_ahead_lowers_the_nose():
     _, command = mellinger.pwm(mellinger.gains(), mellinger.init(), LEVEL, Setpoint.at(jnp.array([0.5, 0, 1.0])), 3.8)
     assert command.attitude[1] < -1 and command.torque[1] > 0
     assert jnp.min(command.pwm[1:3]) > jnp.max(command.pwm[jnp.array([0, 3])])
+
+
+def test_a_lasting_heading_error_is_integrated():
+    target, memory, torques = Setpoint.at(LEVEL.pos, yaw=jnp.array(0.1)), mellinger.init(), []
+    for _ in range(2):
+        memory, command = mellinger.pwm(mellinger.gains(), memory, LEVEL, target, dt=DT)
+        torques.append(float(command.torque[2]))
+    np.testing.assert_allclose(torques[1] / torques[0], (60000 + 2 * 500 * DT) / (60000 + 500 * DT), rtol=1e-9)
+    assert torques[0] > 0

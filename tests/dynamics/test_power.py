@@ -9,6 +9,7 @@ import pytest
 from helpers import assert_close, assert_finite, make_step
 
 import jaxdrones as jd
+from jaxdrones import State
 from jaxdrones.dynamics.power import battery_power, open_circuit_voltage
 
 DRAWN = jd.Model("drawn", lambda params: 0 * params.mass, lambda params, state, _: jd.battery_current(params, state))
@@ -64,6 +65,26 @@ def test_a_slow_drop_comes_to_the_slow_resistance_times_the_current():
     at_rest = jax.vmap(open_circuit_voltage)(battery, end.aux["battery"]["charge"])
     voltage = jax.vmap(jd.battery_voltage)(TEAM, end)
     np.testing.assert_allclose(voltage, at_rest - slow_drop - battery.resistance * current, rtol=1e-12)
+
+
+def test_three_cells_in_series_give_power_and_drop_by_their_common_current():
+    """In NumPy, from 1.225 kg/m^3 and the voltage of three full cells: U (E - U) = R P, Q' = -I, T d' = R_s I - d."""
+    params = jd.load_params("racer")
+    battery = jd.lithium_polymer(
+        capacity=5400, cells=3, resistance=0.04, slow_resistance=0.02, slow_time=9, efficiency=0.5, idle_power=2
+    )
+    params = params.replace(aux={"battery": battery})
+    memory = {"charge": jnp.array(5400.0), "slow_drop": jnp.array(0.3)}
+    state = State(
+        *(jnp.zeros(k) for k in (3, 4, 3, 3)), rpm=jnp.array([9e3, 1e4, 1.1e4, 1.2e4]), aux={"battery": memory}
+    )
+    thrust = float(params.kf) * np.array([9e3, 1e4, 1.1e4, 1.2e4]) ** 2
+    power = 2 + np.sum(thrust**1.5) / np.sqrt(2 * 1.225 * np.pi * float(params.prop_radius) ** 2) / 0.5
+    source = 3 * 4.2 - 0.3
+    voltage = (source + np.sqrt(source**2 - 4 * 0.04 * power)) / 2
+    rate = jd.battery().rate(params, state, state.rpm)
+    np.testing.assert_allclose(rate["charge"], -power / voltage, rtol=2e-3)  # a full cell has 4.2 V to 1e-4
+    np.testing.assert_allclose(rate["slow_drop"], (0.02 * power / voltage - 0.3) / 9, rtol=2e-3)
 
 
 def test_a_weaker_battery_lifts_less():

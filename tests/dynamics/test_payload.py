@@ -337,6 +337,14 @@ def test_the_rows_of_a_shared_load_stay_equal_and_it_starts_near_rest():
         np.testing.assert_array_equal(x, np.broadcast_to(x[:1], x.shape))
 
 
+def test_the_damping_is_a_share_of_the_critical_one_of_load_and_turning_drone():
+    """The vertical cable beside the center of mass moves load and drone, and turns the drone."""
+    params = jd.load_params("cf2x")
+    own = jd.with_payload(params, MASS, damping_ratio=0.2, anchor=(0.02, 0, 0)).aux["payload"]
+    reduced_mass = 1 / (1 / MASS + 1 / float(params.mass) + 0.02**2 / float(params.inertia[1]))
+    np.testing.assert_allclose(own.damping, 0.2 * 2 * np.sqrt(float(own.stiffness) * reduced_mass), rtol=1e-6)
+
+
 def test_steps_and_cables_that_are_unstable_are_refused():
     with pytest.raises(ValueError, match=r"cable is stable up to 1/100 s; give dt=0\.01 and substeps=2"):
         jd.make_step(effects=(jd.cable,), models=(jd.payload(),), dt=0.02)

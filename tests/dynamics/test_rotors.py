@@ -32,6 +32,15 @@ def test_equal_speeds_give_no_torque():
         np.testing.assert_allclose(wrench.torque / params.max_xy_torque, 0, atol=1e-15)
 
 
+def test_thrusts_and_drag_torques_are_proportional_to_the_density_of_the_air():
+    params = jaxdrones.load_params("cf2x")
+    state = State(*(jnp.zeros(k) for k in (3, 4, 3, 3)), rpm=jnp.array([9e3, 1e4, 1.2e4, 1.4e4]))
+    thick, thin = (rotor_wrench(params.replace(air_density=k * params.air_density), state) for k in (1, 0.6))
+    np.testing.assert_allclose(thin.force, 0.6 * thick.force, rtol=1e-12)
+    np.testing.assert_allclose(thin.torque, 0.6 * thick.torque, rtol=1e-12)
+    assert (jnp.abs(thick.torque) > 1e-4).all()
+
+
 def test_instant_rotors_turn_as_commanded():
     params, command = jaxdrones.load_params("cf2x"), jnp.arange(4.0)
     rpm, rate = instant_rotors(params, level, command)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxdrones import State, rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.firmware.crazyflie.commander import LEVEL_AFTER, OFF_AFTER, Commander, decompress
 from jaxdrones.firmware.crazyflie.firmware import Crazyflie
@@ -20,7 +21,7 @@ from jaxdrones.firmware.crazyflie.planner import Goal, go_to
 from jaxdrones.firmware.crazyflie.supervisor import Supervisor
 from jaxdrones.firmware.crazyflie.toc import TYPES, Toc
 from jaxdrones.firmware.crazyflie.variables import VARIABLES, Readings
-from jaxdrones.firmware.crazyflie.vehicle import Sample, motors_off
+from jaxdrones.firmware.crazyflie.vehicle import Sample, _in_world, motors_off, target
 
 SAMPLE = Sample(
     pos=np.array([1.0, 2, 3]),
@@ -366,3 +367,12 @@ def test_what_is_written_to_the_memory_is_read_up_to_the_size_of_a_packet():
     assert ask(2, 7, content) == b"\0"
     assert ask(1, 7, b"\x18") == b"\0" + content[:24] and ask(1, 31, b"\1") == b"\0" + content[24:]
     assert ask(1, 7, b"\x19") == ask(2, 4090, content) == bytes([ENOENT])
+
+
+def test_a_velocity_along_the_heading_is_turned_by_the_present_yaw():
+    """Of the drone, tilted or not; another velocity is that of the world."""
+    yaw, vel = 0.7, np.array([1.0, 2, 3])
+    state = State(*(np.zeros(k) for k in (3, 4, 3, 3, 4))).replace(quat=rotation.from_rpy(np.array([0.2, -0.1, yaw])))
+    found = [_in_world(state, np.array(2.0), target(vel=vel, in_heading=way)).vel for way in (True, False)]
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    np.testing.assert_allclose(found, [turn @ vel, vel], rtol=1e-6)

@@ -42,7 +42,9 @@ class Estimate:
     value: float
     """Estimated value, SI units."""
     std_error: float
-    """Standard error, SI units, with residuals that are correlated over a second; without errors of the model."""
+    """Standard error, SI units, with residuals that are correlated over a second; without errors of the model.
+
+    That of a per-flight parameter is at least that of the mean of values with the scatter of those of the flights."""
     identifiable: bool
     """Whether the parameter is identified: zero is at least two standard errors away.
 
@@ -242,7 +244,9 @@ class _Problem:
         vehicle, errors = self.vehicle(x), standard_errors(information, normal.spread)
         shared = errors[: len(self.shared)]
         per_flight = errors[len(self.shared) :].reshape(len(self.flights), len(self.per_flight))
-        by_name = np.concatenate([shared, np.sqrt(np.sum(per_flight**2, axis=0)) / len(self.flights)])
+        n = len(self.flights)
+        scatter = np.std(x[len(self.shared) :].reshape(per_flight.shape), axis=0) / np.sqrt(max(n - 1, 1))
+        by_name = np.concatenate([shared, np.maximum(np.sqrt(np.sum(per_flight**2, axis=0)) / n, scatter)])
         estimates = {name: _estimate(vehicle, name, error) for name, error in zip(self.names, by_name, strict=True)}
         unidentifiable = [
             f"{name} ({short_repr(e.value)} +- {e.std_error:.2g})"

@@ -164,6 +164,16 @@ def test_the_error_of_a_median_over_flights_falls_with_the_root_of_their_number(
     assert four.std_error == pytest.approx(one.std_error / 2) and 0 < one.std_error < np.inf
 
 
+def test_the_error_of_a_median_has_the_scatter_of_the_flights(problem_of):
+    """Trims that differed by 1.6e-4 N m had a median with an error of 1e-7 N m, as if each flight had this trim."""
+    problem = problem_of(3, ("trim_torque_x",))
+    x = np.array([0.1, 0.4, 0.7])
+    normal = problem.normal(x, [np.full((3, 4), 1e-6)] * 3)
+    estimate = problem._report(x, normal._replace(spread=0 * normal.spread), (), (), False).parameters["trim_torque_x"]
+    assert estimate.value == pytest.approx(0.4e-4)
+    assert estimate.std_error == pytest.approx(0.3e-4 / np.sqrt(3))
+
+
 def test_a_vehicle_whose_thrust_carries_and_lifts_it_is_in_balance():
     vehicle, motors = Vehicle.of(jaxdrones.load_params("cf21")), crazyflie_motors()
     duty, battery, up = jnp.full((1, 100, 4), 0.6), jnp.full((1, 100), 3.9), jnp.full((1, 100), 0.9)

@@ -321,3 +321,18 @@ def test_a_heading_that_crosses_half_a_turn_has_no_kick():
         )
     np.testing.assert_allclose(targets[0], [0, 0, -0.35 * 2 / DT], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(targets[0], targets[1], rtol=1e-9, atol=1e-9)
+
+
+def test_the_output_of_the_vertical_loop_is_limited_about_the_base_thrust():
+    gains = firmware_pid.gains().replace(base_thrust=jnp.array(30000.0))
+    up = jnp.array([0, 0, 1e3])
+    thrusts = [float(firmware_loops.velocity_loop(gains, firmware_pid.init(), LEVEL, v, DT)[2]) for v in (up, -up)]
+    assert thrusts == [pytest.approx(30000 + 32767), 20000]
+
+
+def test_the_voltage_is_filtered_over_a_tenth_of_a_second_whatever_the_rate():
+    """From 4 to 3 V by 1 % of the rest in a millisecond; the first voltage is taken as it is."""
+    motor = firmware_pid.gains().motor
+    arguments = motor, jnp.array(3e4), jnp.zeros(3), 3.0
+    for before, dt, after in ((4.0, 0.001, 3.99), (4.0, 0.002, 3 + 0.99**2), (0.0, 0.002, 3.0)):
+        assert firmware_motors.duty_cycles(*arguments, jnp.array(before), dt)[0] == pytest.approx(after, rel=1e-9)

@@ -32,10 +32,11 @@ from jaxdrones.flights import (
 from jaxdrones.flights.fit import Estimate, Report, _estimate, _Problem
 from jaxdrones.flights.least_squares import spread, standard_errors
 from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
-from jaxdrones.flights.parameters import check_guess
+from jaxdrones.flights.parameters import PARAMETERS, check_guess, value_of, with_parameters
 from jaxdrones.flights.path_fit import _balance_residuals, _least_squares
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
+from jaxdrones.flights.vehicle import Instruments
 from jaxdrones.urdf import parse_params
 from jaxdrones.urdf_writer import to_urdf
 
@@ -172,6 +173,27 @@ def test_the_error_of_a_median_has_the_scatter_of_the_flights(problem_of):
     estimate = problem._report(x, normal._replace(spread=0 * normal.spread), (), (), False).parameters["trim_torque_x"]
     assert estimate.value == pytest.approx(0.4e-4)
     assert estimate.std_error == pytest.approx(0.3e-4 / np.sqrt(3))
+
+
+def test_a_coordinate_changes_its_parameter_by_its_scale():
+    """A positive parameter becomes exp(0.3) times as large, another one 0.3 scales larger."""
+    vehicle = Vehicle.of(jaxdrones.load_params("cf21"))
+    for name in ("inertia_y", "rotor_lag", "rate_damping_xy", "center_of_mass_x", "tilt_y"):
+        before, after = value_of(vehicle, name), value_of(with_parameters(vehicle, [name], [0.3]), name)
+        scale = PARAMETERS[name].scale
+        expected = before * np.exp(0.3) if scale is None else before + 0.3 * scale
+        assert after == pytest.approx(expected, rel=1e-6), name
+
+
+def test_a_log_is_that_of_its_instruments():
+    """The tilt turns the attitude there and back, and only horizontal distances are scaled."""
+    quat, pos = rotation.from_rpy(jnp.array([0.3, -0.2, 1.0])), jnp.array([1.0, 2, 3])
+    ours = Instruments.ideal().replace(tilt=jnp.array([0.02, -0.03]), position_scale=jnp.array(0.9))
+    true = jax.jit(ours.true_attitude)(quat)
+    np.testing.assert_allclose(jax.jit(ours.logged_attitude)(true), quat, rtol=1e-6)
+    turned = jax.jit(lambda: rotation.log(rotation.multiply(rotation.conjugate(quat), true)))()
+    np.testing.assert_allclose(turned, [0.02, -0.03, 0], atol=1e-6)
+    np.testing.assert_allclose(ours.logged_position(pos, jnp.ones(3)), [1, 1.9, 3], rtol=1e-6)
 
 
 def test_a_vehicle_whose_thrust_carries_and_lifts_it_is_in_balance():

@@ -1,7 +1,8 @@
-"""Functions of one world that `jax.vmap` computes number by number.
+"""Functions of one world that `jax.vmap` computes in kernels of their own.
 
 The primitive here keeps the program of one world under `jax.vmap` and under derivatives. Only when it is compiled, it
-is laid out for all worlds, see `soa`: a single kernel on a CPU, few kernels on an accelerator.
+is laid out for all worlds, see `soa`: a single kernel on a CPU, few kernels on an accelerator. Programs of few entries
+are computed number by number, others array by array, which on an accelerator is left to `jax.vmap`.
 """
 
 import functools
@@ -28,10 +29,9 @@ R = TypeVar("R")
 
 
 def apart_under_vmap(function: Callable[P, R]) -> Callable[P, R]:
-    """Compute a function of one world number by number under `jax.vmap`, and so its derivatives.
+    """Compute a function of one world in kernels of its own under `jax.vmap`, and so its derivatives.
 
-    In reverse mode it is recomputed. It is unchanged if its arrays are too large or too many, or if a primitive forbids
-    it.
+    In reverse mode it is recomputed. It is unchanged if a primitive forbids it.
     """
 
     def called(*arguments: P.args, **named: P.kwargs) -> R:
@@ -54,19 +54,24 @@ def _called(function: Callable, tree: Any, leaves: Sequence) -> Any:
 
 
 def _fits(program: Any) -> bool:
-    return can_be_a_kernel(program) and fits_number_by_number(program) and has_few_entries(program)
+    return can_be_a_kernel(program) and (compiler.is_cpu() or _by_numbers(program))
+
+
+def _by_numbers(program: Any) -> bool:
+    return fits_number_by_number(program) and has_few_entries(program)
 
 
 def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: int | None) -> list[Array]:
     if worlds is None:
         return compiler.as_function(program, ())(*inputs)
     by_vmap = one_world.by_vmap(program, mapped, worlds)
-    if not worlds or not _fits(program):  # a derivative can be larger than its function
+    if not worlds or not _fits(program):  # a derivative can have other primitives than its function
         return by_vmap(*inputs)
 
     def many(same: Sequence[Array], varying: Sequence[Array]) -> list[Array]:
         found = {True: iter([jnp.moveaxis(x, 0, -1) for x in varying]), False: iter(same)}
-        results = over_last_axis(program, [next(found[varies]) for varies in mapped], mapped)
+        last = [next(found[varies]) for varies in mapped]
+        results = over_last_axis(program, last, mapped, by_numbers=_by_numbers(program))
         return [jnp.moveaxis(x, -1, 0) for x in results]
 
     same, varying = ([x for x, varies in zip(inputs, mapped, strict=True) if varies == wanted] for wanted in (0, 1))

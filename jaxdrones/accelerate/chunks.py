@@ -16,7 +16,7 @@ from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.compiler import is_cpu
 from jaxdrones.accelerate.fitting import fits_a_kernel, fits_number_by_number, gains_by_chunks
 from jaxdrones.accelerate.reordered import has_reordered, store_reordered
-from jaxdrones.accelerate.soa import vmap_for_kernel
+from jaxdrones.accelerate.soa import over_last_axis
 from jaxdrones.arguments import Count, checked
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
@@ -78,7 +78,7 @@ class ChunkedProgram:
 
         def of_worlds(consts, leaves):
             last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
-            return [jnp.moveaxis(x, -1, 0) for x in vmap_for_kernel(self.program, consts, last)]
+            return [jnp.moveaxis(x, -1, 0) for x in over_last_axis(self.program, last, [True] * len(last), consts)]
 
         @jax.custom_jvp
         def flown(consts, leaves):

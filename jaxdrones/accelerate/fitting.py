@@ -38,8 +38,8 @@ SHAPES = frozenset(
 )
 """Rearranging primitives."""
 
-IDENTITIES = frozenset("copy copy_p optimization_barrier xla_metadata_value".split())
-"""Identity primitives."""
+IDENTITIES = frozenset("copy copy_p optimization_barrier reshard xla_metadata_value".split())
+"""Identity primitives; `reshard` is one because no mesh divides the arrays of one world."""
 
 REDUCTIONS = frozenset("reduce_sum reduce_prod reduce_max reduce_min reduce_and reduce_or".split())
 

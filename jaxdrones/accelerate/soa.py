@@ -32,29 +32,26 @@ from jaxdrones.accelerate.reordered import store_reordered
 from jaxdrones.accelerate.shared import store_shared
 
 _BY_NUMBERS = ELEMENTWISE | SHAPES | REDUCTIONS | PRODUCTS
-_RULES = dict.fromkeys(REDUCTIONS, reduced) | dict.fromkeys(PRODUCTS, product)
-
-
-def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
-    """Evaluate a program of one world that `fits_a_kernel` for many worlds, with inputs (..., worlds).
-
-    Raises:
-        NoKernelError: the program cannot be a single kernel.
-    """
-    if not fits_number_by_number(program):
-        return jax.vmap(functools.partial(store_reordered, program, consts, rules=_RULES), -1, -1)(*leaves)
-
-    return over_last_axis(program, leaves, [True] * len(leaves), consts)
+_RULES = dict.fromkeys(REDUCTIONS, reduced) | dict.fromkeys(PRODUCTS, product) | {"reshard": lambda _, x: [x]}
 
 
 def over_last_axis(
-    program: Any, inputs: Sequence[Array], varies: Sequence[bool], consts: Sequence[Array] = ()
+    program: Any,
+    inputs: Sequence[Array],
+    varies: Sequence[bool],
+    consts: Sequence[Array] = (),
+    by_numbers: bool | None = None,
 ) -> list[Array]:
-    """Evaluate a program of one world number by number, with the worlds last in the results and varying inputs.
+    """Evaluate a program of one world in a form for kernels, with the worlds last in the results and varying inputs.
+
+    By default it is computed number by number if it `fits_number_by_number`, otherwise array by array.
 
     Raises:
         NoKernelError: the program cannot be a single kernel.
     """
+    if not (fits_number_by_number(program) if by_numbers is None else by_numbers):
+        axes = [-1 if each else None for each in varies]
+        return jax.vmap(functools.partial(store_reordered, program, consts, rules=_RULES), axes, -1)(*inputs)
     worlds = next(x.shape[-1] for x, each in zip(inputs, varies, strict=True) if each)
 
     def evaluated(consts, inputs):

@@ -108,11 +108,12 @@ def test_what_it_closes_over_may_be_traced():
 
 
 @pytest.mark.parametrize(
-    ("size", "length", "each"),
-    [(3, 3, jnp.sort), (50, 3, jnp.negative), (36, 400, jnp.negative)],
-    ids=["sorting", "large arrays", "many arrays, which would compile for long"],
+    ("size", "length", "each", "kernel"),
+    [(3, 3, jnp.sort, False), (50, 3, jnp.negative, True), (36, 400, jnp.negative, True)],
+    ids=["sorting", "large arrays", "many arrays, which would compile for long number by number"],
 )
-def test_what_cannot_be_apart_is_as_vmap_computes_it(size, length, each):
+def test_what_cannot_be_apart_is_as_vmap_computes_it(size, length, each, kernel):
+    """Sorting by several kernels; large and many arrays in one kernel, array by array."""
     x = jnp.asarray(rng.normal(size=(4, size)))
 
     def function(x):
@@ -121,7 +122,7 @@ def test_what_cannot_be_apart_is_as_vmap_computes_it(size, length, each):
         return jax.lax.scan(lambda x, _: (each(x), None), x, length=length)[0]
 
     ours = jax.jit(jax.vmap(apart_under_vmap(function)))
-    assert "small_call" not in ours.lower(x).as_text()
+    assert ("small_call" in ours.lower(x).as_text()) == kernel
     np.testing.assert_array_equal(ours(x), jax.vmap(function)(x))
 
 
@@ -191,6 +192,36 @@ def test_many_worlds_are_one_kernel_and_one_world_is_none():
     function = apart_under_vmap(swung)
     assert jax.jit(jax.vmap(function)).lower(X, PUSH).as_text().count("small_call") == 1
     assert "small_call" not in jax.jit(function).lower(X[0], PUSH[0]).as_text()
+
+
+def test_a_mesh_of_devices_leaves_the_kernel():
+    """Where a mesh is set, as in trainings, JAX notes at a choice how its result is shared by devices."""
+    chosen = apart_under_vmap(lambda x, push: {"end": jnp.where(x > 0, x, 0) + push, "seen": x})
+    with jax.set_mesh(jax.make_mesh((1,), ("worlds",), axis_types=(jax.sharding.AxisType.Auto,))):
+        program = jax.jit(jax.vmap(chosen)).lower(X, PUSH).as_text()
+    assert program.count("small_call") == 1
+
+
+@pytest.mark.parametrize("across", [None, pytest.param(0, marks=pytest.mark.slow)])
+def test_derivatives_of_large_arrays_are_those_of_vmap(across):
+    """Array by array, with a product, a sum over an axis and an argument that all worlds may share."""
+    arm = jnp.array([[0.0, 1.0, 0.5], [-1.0, 0.0, 2.0], [0.3, 0.2, 1.0]])
+
+    def function(x, push):
+        def advance(x, _):
+            return jnp.tanh(x * (push @ arm) + jnp.sum(x, axis=0, keepdims=True)), x[1]
+
+        end, seen = jax.lax.scan(advance, x, length=3)
+        return {"end": end, "seen": seen}
+
+    x, push = jnp.asarray(rng.normal(size=(4, 20, 3))), jnp.asarray(rng.normal(size=(4, 1, 3)))
+    push = push[0] if across is None else push
+    ours, theirs = (
+        jax.jit(jax.vmap(jax.grad(functools.partial(total, f), (0, 1)), (0, across)))
+        for f in (apart_under_vmap(function), function)
+    )
+    assert "small_call" in ours.lower(x, push).as_text()
+    same(ours(x, push), theirs(x, push))
 
 
 @pytest.mark.slow

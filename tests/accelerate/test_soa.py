@@ -11,7 +11,7 @@ from helpers import flying, tape
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.fitting import can_be_a_kernel
-from jaxdrones.accelerate.soa import vmap_for_kernel
+from jaxdrones.accelerate.soa import over_last_axis
 
 rng = np.random.default_rng(0)
 start, pushes = rng.normal(size=(3, 5)), rng.normal(size=(4, 3, 5))  # worlds last
@@ -25,7 +25,7 @@ def vmap_apart(function):
         leaves, tree = jax.tree.flatten(arguments)
         of_one = [jax.ShapeDtypeStruct(x.shape[:-1], x.dtype) for x in leaves]
         program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one)
-        return jax.tree.structure(shape).unflatten(vmap_for_kernel(program, consts, leaves))
+        return jax.tree.structure(shape).unflatten(over_last_axis(program, leaves, [True] * len(leaves), consts))
 
     return many
 

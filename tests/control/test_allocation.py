@@ -195,9 +195,9 @@ def test_a_demand_of_thrust_far_beyond_reach_is_full_thrust_with_roll_and_pitch(
     """In single precision the difference between demand and limit was lost, and the rotors stood still."""
     params = jaxdrones.load_params(vehicle)
     torque = jnp.array([0.05, -0.02, 0.3]) * params.max_xy_torque
-    thrusts = params.max_thrust * 10.0 ** jnp.arange(3, 30)
-    rpm = jit_optimized(jax.vmap(rpm_from_wrench, (None, 0, None)))(params, thrusts, torque)
-    expected = jit_unoptimized(rpm_from_wrench)(params, 2 * params.max_thrust, torque)
+    thrusts = params.max_thrust * jnp.logspace(3, 29, N)
+    rpm = allocate_all(params, thrusts, jnp.broadcast_to(torque, (N, 3)))
+    expected = allocate(params, 2 * params.max_thrust, torque)
     assert jnp.max(expected) == params.max_rpm
     np.testing.assert_allclose(rpm, np.broadcast_to(expected, rpm.shape), rtol=1e-4)  # roundings of 100 times the limit
 

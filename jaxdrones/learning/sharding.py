@@ -13,6 +13,7 @@ A CPU is one device by default. Before the first use of JAX, set `jax.config.upd
 `XLA_FLAGS=--xla_force_host_platform_device_count=2` in the environment.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -102,5 +103,9 @@ def share_of_mean(x: Array, where: Array | None = None) -> Array:
 
 def gather(mesh: Mesh, tree: Any) -> Any:
     """Copy of the whole tree on one device of each host; every host has to call this."""
-    copies = jax.jit(lambda x: x, out_shardings=replicated(mesh))(tree)
-    return jax.tree.map(lambda x: x.addressable_data(0), copies)
+    return jax.tree.map(lambda x: x.addressable_data(0), _copier(mesh)(tree))
+
+
+@functools.cache
+def _copier(mesh: Mesh) -> Callable[[Any], Any]:
+    return jax.jit(lambda x: x, out_shardings=replicated(mesh))

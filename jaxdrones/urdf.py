@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxdrones import assets
@@ -109,9 +109,9 @@ def _params(urdf: "_Urdf") -> Params:
         )[2],
     )
     urdf.check_what_params_cannot_hold()
-    _check_flies(urdf.name, {name: np.asarray(value, float) for name, value in values.items()}, float(thrust2weight))
-    arrays: dict[str, Any] = {name: jnp.asarray(value, float) for name, value in values.items()}
-    return Params(**arrays)
+    arrays: dict[str, Any] = {name: np.asarray(value, float) for name, value in values.items()}
+    _check_flies(urdf.name, arrays, float(thrust2weight))
+    return Params(**jax.tree.map(jax.numpy.asarray, arrays))
 
 
 def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> None:

@@ -8,7 +8,7 @@ import golden_data
 import jax
 import jax.numpy as jnp
 import numpy as np
-from helpers import jit_unoptimized
+from helpers import hover_rpm, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Params, State
@@ -18,8 +18,8 @@ make_step = lru_cache(jaxdrones.make_step)
 
 
 def one(team: Any, i: int = 0) -> Any:
-    """One drone of a team."""
-    return jax.tree.map(lambda x: x[i], team)
+    """One drone of a team; by NumPy where nothing is traced, as JAX compiles a program for each shape."""
+    return jax.tree.map(lambda x: x[i] if isinstance(x, jax.core.Tracer) else jnp.asarray(np.asarray(x)[i]), team)
 
 
 def team_of(*vehicles: str) -> Params:
@@ -47,7 +47,7 @@ def hovering(team: Params, pos=(0.0, 0.0, 1.0)) -> State:
     """Level and at rest, with the rotors at hover speed."""
     n = len(team.mass)
     state = State.at_rest(np.tile(pos, (n, 1)))
-    return state.replace(rpm=jnp.broadcast_to(team.hover_rpm[:, None], (n, 4)))
+    return state.replace(rpm=jnp.asarray(np.broadcast_to(hover_rpm(team), (n, 4))))
 
 
 def at(n: int, pos, **rest) -> Setpoint:

@@ -50,24 +50,30 @@ def name_of(function) -> str:
     return function.__name__
 
 
+def hover_rpm(params: Params) -> np.ndarray:
+    """(n, 1), rotor speeds of a team in hover, RPM; by NumPy, as JAX compiles every operation for every size."""
+    mass, gravity, kf = map(np.asarray, (params.mass, params.gravity, params.kf))
+    return np.sqrt(mass * gravity / (4 * kf))[:, None]
+
+
 def flying(params: Params, seed: int = 0, tilt: float = 1.0) -> State:
     """A team in full flight near (0, 0, 1) m; `tilt` 1 is any attitude, 0 is level."""
     rng = np.random.default_rng(seed)
     n = len(params.mass)
     quat = tilt * rng.normal(size=(n, 4)) + [0, 0, 0, 1 - tilt]
     return State(
-        pos=jnp.array(rng.uniform([-0.4, -0.4, 0.6], [0.4, 0.4, 1.4], (n, 3))),
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
-        vel=jnp.array(rng.uniform(-3, 3, (n, 3))),
-        omega=jnp.array(rng.uniform(-5, 5, (n, 3))),
-        rpm=jnp.array(rng.uniform(0.7, 1.1, (n, 4))) * params.hover_rpm[:, None],
+        pos=jnp.asarray(rng.uniform([-0.4, -0.4, 0.6], [0.4, 0.4, 1.4], (n, 3))),
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
+        vel=jnp.asarray(rng.uniform(-3, 3, (n, 3))),
+        omega=jnp.asarray(rng.uniform(-5, 5, (n, 3))),
+        rpm=jnp.asarray(rng.uniform(0.7, 1.1, (n, 4)) * hover_rpm(params)),
     )
 
 
 def tape(params: Params, length: int, seed: int = 1) -> jax.Array:
     """Rotor speeds (length, n, 4) within a tenth of the hover speed."""
     shape = (length, len(params.mass), 4)
-    return jnp.array(np.random.default_rng(seed).uniform(0.9, 1.1, shape)) * params.hover_rpm[None, :, None]
+    return jnp.asarray(np.random.default_rng(seed).uniform(0.9, 1.1, shape) * hover_rpm(params))
 
 
 @partial(jit_unoptimized, static_argnums=0)

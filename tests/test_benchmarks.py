@@ -65,7 +65,7 @@ def test_battery_finds_the_resistance_that_a_flight_was_made_with(tmp_path):
     )
     step = jd.make_step(rotors=jd.pwm_rotors, models=(jd.battery(),), dt=0.005, substeps=2)
     time = np.arange(500) / 100
-    pwm = jnp.array(np.where(time < 2, 0.0, 50e3)[:, None] * np.ones(4))
+    pwm = jnp.asarray(np.where(time < 2, 0.0, 50e3)[:, None] * np.ones(4))
     team = jd.repeat(params, 1)
     start = jd.State.at_rest(np.zeros((1, 3)))
     states = jd.rollout(step, lambda p, m, s, k: (m, pwm[k][None]), team, start, None, len(pwm))[1]

@@ -21,7 +21,7 @@ vectors = np.random.default_rng(2).normal(size=(50, 3))
 
 
 def each(function, *arrays):
-    return np.asarray(jax.jit(jax.vmap(function))(*map(jnp.array, arrays)))
+    return np.asarray(jax.jit(jax.vmap(function))(*map(jnp.asarray, arrays)))
 
 
 def up_to_sign(quat):
@@ -174,7 +174,7 @@ def test_angles_in_single_precision_are_right_however_they_are_compiled(count, n
         check_angles(quats, compiled(in_worlds)(quats))
         check_angles(quats, compiled(jax.vmap(rotation.to_rpy))(quats))
     check_angles(quats, jax.vmap(rotation.to_rpy)(quats))  # eager
-    check_angles(quats[-5:], [jit_optimized(rotation.to_rpy)(quat) for quat in quats[-5:]])
+    check_angles(quats[-5:], list(map(jit_optimized(rotation.to_rpy), quats[-5:])))
 
 
 @pytest.mark.slow

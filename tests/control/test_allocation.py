@@ -48,7 +48,7 @@ def test_roll_pitch_and_yaw_of_the_mixer_turn_about_their_own_axis(vehicle):
 @pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree(name):
     case = golden_data.load(name)
-    action = jnp.array(case.arrays["action"])
+    action = jnp.asarray(case.arrays["action"])
     assert 0 < case.arrays["infeasible"].sum() < len(action)
     rpm = allocate_all(golden_data.unlimited(recorded_vehicle(case)), action[:, 0], action[:, 1:])
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 1e-11
@@ -60,7 +60,7 @@ def test_recorded_allocations_agree(name):
 def test_recorded_allocations_agree_in_float32(name):
     case = golden_data.load(name)
     params = golden_data.unlimited(recorded_vehicle(case))
-    action = jnp.array(case.arrays["action"])
+    action = jnp.asarray(case.arrays["action"])
     rpm = allocate_all(params, action[:, 0], action[:, 1:])
     # Thrusts are differences of terms of the size of the largest, so it is squares that agree: a few roundings of 6e-8.
     scale = np.max(case.arrays["rpm"] ** 2, axis=-1, keepdims=True)
@@ -315,7 +315,7 @@ def wild_wrenches(params, seed):
     rng = np.random.default_rng(seed)
     thrust = params.max_thrust * rng.uniform(-0.1, 1, N)
     limits = np.array([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
-    return thrust, jnp.array(rng.uniform(-1, 1, (N, 3)) * limits)
+    return thrust, jnp.asarray(rng.uniform(-1, 1, (N, 3)) * limits)
 
 
 def wrenches_of_targets(params, target):

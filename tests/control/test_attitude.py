@@ -18,7 +18,7 @@ gradients = jax.jit(jax.jacrev(from_thrust, argnums=(0, 1)))
 
 def directions(n, seed=0):
     rng = np.random.default_rng(seed)
-    return jnp.array(rng.normal(size=(n, 3))), jnp.array(rng.uniform(-np.pi, np.pi, n))
+    return jnp.asarray(rng.normal(size=(n, 3))), jnp.asarray(rng.uniform(-np.pi, np.pi, n))
 
 
 def test_the_attitude_of_a_thrust_is_a_rotation_with_z_along_it():

@@ -77,7 +77,9 @@ def test_rotor_speeds_are_within_what_the_motors_can_in_any_state(loop):
         offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
         target = Setpoint(state.pos + offset[0], offset[1], offset[2], offset[3][:, 0], offset[3])
         target = jnp.column_stack([offset[0], offset[1][:, 0]]) if loop in VELOCITY else target
-        memory = jax.tree.map(lambda x, size=size: jnp.array(size * rng.normal(size=x.shape)), for_team(loop.init(), N))
+        memory = jax.tree.map(
+            lambda x, size=size: jnp.asarray(size * rng.normal(size=x.shape)), for_team(loop.init(), N)
+        )
         _, rpm = call(loop.control, loop.gains(), team, memory, state, target)
         assert jnp.all((rpm >= 0) & (rpm <= team.max_rpm[:, None]))
 
@@ -326,7 +328,7 @@ def in_flight(loop, size=1.0):
     offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
     rpy = to_rpy(state.quat)
     if loop in VELOCITY:
-        target = jnp.array(size * rng.normal(size=(N, 4)))
+        target = jnp.asarray(size * rng.normal(size=(N, 4)))
     else:
         target = Setpoint(
             pos=state.pos + offset[0], vel=offset[1], acc=offset[2], yaw=rpy[:, 2] + offset[3][:, 0], omega=offset[3]

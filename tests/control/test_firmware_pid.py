@@ -270,7 +270,7 @@ def test_gradients_of_limited_commands_are_finite_however_a_compiler_rounds():
     """The largest command is chosen without comparing a command with a second rounding of it."""
     rng = np.random.default_rng(5)
     params, gains = jaxdrones.load_params("cf2x"), firmware_pid.gains()
-    thrust, torque = jnp.array(rng.uniform(3e4, 6.5e4, 500)), jnp.array(rng.uniform(-3e4, 3e4, (500, 3)))
+    thrust, torque = jnp.asarray(rng.uniform(3e4, 6.5e4, 500)), jnp.asarray(rng.uniform(-3e4, 3e4, (500, 3)))
 
     def total(thrust, torque):
         return jnp.sum(firmware_motors.rotor_speeds(gains.motor, params, 1.1 * thrust + 3.3, 0.7 * torque))

@@ -143,8 +143,8 @@ def call(team, state, setpoint):
 
 def wild_setpoints(n, seed=5):
     rng = np.random.default_rng(seed)
-    pos, vel, acc, omega = jnp.array(rng.normal(size=(4, n, 3)))
-    return Setpoint(pos, vel, acc, jnp.array(rng.uniform(-np.pi, np.pi, n)), omega)
+    pos, vel, acc, omega = jnp.asarray(rng.normal(size=(4, n, 3)))
+    return Setpoint(pos, vel, acc, jnp.asarray(rng.uniform(-np.pi, np.pi, n)), omega)
 
 
 def circle():

@@ -54,9 +54,9 @@ def test_velocities_are_commanded_as_recorded(name):
 def assert_commands(controller, case):
     """After every step the controller is called for the next one; the last command was not flown."""
     arrays = case.arrays
-    pos = jnp.array(arrays["target_pos"])
-    vel = jnp.broadcast_to(jnp.array(arrays.get("target_vel", 0.0)), pos.shape)
-    yaw = jnp.broadcast_to(jnp.array(arrays["target_rpy"][..., 2]), pos.shape[:-1])
+    pos = jnp.asarray(arrays["target_pos"])
+    vel = jnp.broadcast_to(jnp.asarray(arrays.get("target_vel", 0.0)), pos.shape)
+    yaw = jnp.broadcast_to(jnp.asarray(arrays["target_rpy"][..., 2]), pos.shape[:-1])
     team, dt = team_and_dt(case)
     memory = for_team(controller.init(), len(team.mass))
     targets = Setpoint.at(pos, vel=vel, yaw=yaw)

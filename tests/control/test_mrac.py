@@ -35,8 +35,8 @@ def recorded(request):
 def recorded_gains(arrays):
     """Poles are placed by iteration, which another LAPACK ends elsewhere; the calls do not depend on that."""
     fields = dict(feedback="Kx0", feedforward="Kr0", model="Am", inputs="Bm", lyapunov="P")
-    values = {field: jnp.array(arrays[name]) for field, name in fields.items()}
-    return mrac.gains().replace(reference=-jnp.array(arrays["Kr_ref_gain"]), **values)
+    values = {field: jnp.asarray(arrays[name]) for field, name in fields.items()}
+    return mrac.gains().replace(reference=-jnp.asarray(arrays["Kr_ref_gain"]), **values)
 
 
 @pytest.mark.slow

@@ -43,8 +43,8 @@ def test_recorded_single_calls_agree_in_float32(name):
 def test_recorded_sequences_agree_in_speeds_and_memory(name):
     case = golden_data.load(name)
     keys = ("pos", "quat", "vel", "target_pos", "target_rpy", "target_vel")
-    sequences = [jnp.array(case.arrays[key]) for key in keys]
-    memory, rpm = call_in_sequence(recorded_vehicle(case), jnp.array(case.arrays["dt"]), *sequences)
+    sequences = [jnp.asarray(case.arrays[key]) for key in keys]
+    memory, rpm = call_in_sequence(recorded_vehicle(case), jnp.asarray(case.arrays["dt"]), *sequences)
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 7e-11
     np.testing.assert_allclose(memory.pos_integral, case.arrays["integral_pos_e"], rtol=0, atol=1e-12)
     np.testing.assert_allclose(memory.rpy_integral, case.arrays["integral_rpy_e"], rtol=0, atol=1e-12)
@@ -79,7 +79,7 @@ def test_at_48_hz_it_is_in_a_limit_cycle_and_at_120_hz_it_is_not():
 def test_it_never_leaves_the_range_of_its_motors():
     params = jaxdrones.load_params("cf2x")
     state = one(hovering(team_of("cf2x")))
-    pos = jnp.array(np.random.default_rng(0).uniform(-50, 50, (100, 3)))
+    pos = jnp.asarray(np.random.default_rng(0).uniform(-50, 50, (100, 3)))
     _, rpm = jit_unoptimized(jax.vmap(lambda pos: call(params, state, Setpoint.at(pos))))(pos)
     lowest, highest = 0.2685 * np.array([20000, 65535]) + 4070.3
     np.testing.assert_allclose([jnp.min(rpm), jnp.max(rpm)], [lowest, highest], rtol=1e-12)
@@ -105,7 +105,7 @@ def call(params, state, setpoint, memory=None):
 
 
 def inputs(case):
-    return [jnp.array(case.arrays[key]) for key in INPUTS]
+    return [jnp.asarray(case.arrays[key]) for key in INPUTS]
 
 
 @jax.jit

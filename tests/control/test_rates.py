@@ -28,7 +28,7 @@ def command_all(params, *rows):
 @pytest.mark.parametrize("name", golden_data.names("ctbr"))
 def test_recorded_commands_agree(name):
     case = golden_data.load(name)
-    collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.array(case.arrays[key]) for key in INPUTS))
+    collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.asarray(case.arrays[key]) for key in INPUTS))
     np.testing.assert_allclose(collective, case.arrays["ctbr"][:, 0], rtol=0, atol=1e-9)  # measured: 1e-14
     np.testing.assert_allclose(omega, case.arrays["ctbr"][:, 1:], rtol=0, atol=1e-9)
 
@@ -37,7 +37,7 @@ def test_recorded_commands_agree(name):
 @pytest.mark.parametrize("name", golden_data.names("ctbr"))
 def test_recorded_commands_agree_in_float32(name):
     case = golden_data.load(name)
-    collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.array(case.arrays[key]) for key in INPUTS))
+    collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.asarray(case.arrays[key]) for key in INPUTS))
     # A few roundings of 6e-8 in numbers around 30 and 10.
     np.testing.assert_allclose(collective, case.arrays["ctbr"][:, 0], rtol=0, atol=2e-5)
     np.testing.assert_allclose(omega, case.arrays["ctbr"][:, 1:], rtol=0, atol=2e-5)

@@ -16,7 +16,7 @@ from jaxdrones.control.setpoint import Setpoint
 @pytest.mark.parametrize("name", golden_data.names("last_rpy_e"))
 def test_recorded_sequences_agree_in_speeds_and_memory(name):
     case = golden_data.load(name)
-    rows = [jnp.array(case.arrays[key]) for key in ("pos", "quat", "target_pos")]
+    rows = [jnp.asarray(case.arrays[key]) for key in ("pos", "quat", "target_pos")]
     memory, rpm = call_in_sequence(golden_data.unlimited(recorded_vehicle(case)), case.about["dt"], *rows)
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 2e-11
     np.testing.assert_allclose(memory.pos_integral, case.arrays["integral_pos_e"], rtol=0, atol=1e-12)

@@ -15,7 +15,7 @@ from jaxdrones.control import for_team, pid, velocity
 @pytest.mark.parametrize("name", golden_data.names("action", "rpm", speed_limit=float))
 def test_recorded_sequences_agree(name):
     case = golden_data.load(name)
-    rows = [jnp.array(case.arrays[key]) for key in ("pos", "quat", "vel", "action")]
+    rows = [jnp.asarray(case.arrays[key]) for key in ("pos", "quat", "vel", "action")]
     rpm = call_in_sequence(recorded_vehicle(case), case.about["control_dt"], *rows)
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 3e-11
 

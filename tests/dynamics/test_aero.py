@@ -44,7 +44,7 @@ def hovering(height, tilt=0.0):
 def test_forces_of_the_paper_are_the_recorded_ones(name):
     """1e-9 N and 1e-9 relative; measured 3e-17 N."""
     case = golden_data.load(name)
-    recorded = {key: jnp.array(value) for key, value in case.arrays.items()}
+    recorded = {key: jnp.asarray(value) for key, value in case.arrays.items()}
     zero = jnp.zeros_like(recorded["pos0"])
     states = State(recorded["pos0"], recorded["quat0"], recorded["vel0"], zero, recorded["rpm0"])
     params = golden_data.recorded_params(case)

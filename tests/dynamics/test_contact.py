@@ -32,10 +32,10 @@ def random_states(n, n_drones=1, seed=0, speed=5.0, below=0.0):
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, n_drones, 4))
     return State(
-        pos=jnp.array(rng.uniform([-0.05, -0.05, -below], [0.05, 0.05, 0.06], (n, n_drones, 3))),
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
-        vel=jnp.array(rng.uniform(-speed, speed, (n, n_drones, 3))),
-        omega=jnp.array(rng.uniform(-10, 10, (n, n_drones, 3))),
+        pos=jnp.asarray(rng.uniform([-0.05, -0.05, -below], [0.05, 0.05, 0.06], (n, n_drones, 3))),
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
+        vel=jnp.asarray(rng.uniform(-speed, speed, (n, n_drones, 3))),
+        omega=jnp.asarray(rng.uniform(-10, 10, (n, n_drones, 3))),
         rpm=jnp.zeros((n, n_drones, 4)),
     )
 
@@ -262,9 +262,9 @@ def crash(params, speed, towards, n=30):
     path /= np.linalg.norm(path, axis=1, keepdims=True)
     distance = float(2 * params.collision_radius + params.collision_height)
     start = State(
-        pos=jnp.array(np.stack([path * distance, 0 * path], axis=1) + np.array([0, 0, 5.0])),
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
-        vel=jnp.array(np.stack([-path, path], axis=1)) * speed / 2,
+        pos=jnp.asarray(np.stack([path * distance, 0 * path], axis=1) + np.array([0, 0, 5.0])),
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
+        vel=jnp.asarray(np.stack([-path, path], axis=1)) * speed / 2,
         omega=jnp.zeros((n, 2, 3)),
         rpm=jnp.zeros((n, 2, 4)),
     )
@@ -403,10 +403,10 @@ def thrown(n, seed=0):
     rng = np.random.default_rng(seed)
     quat = np.concatenate([0.05 * rng.normal(size=(n, 2)), rng.uniform(-0.1, 0.1, (n, 1)), np.ones((n, 1))], axis=1)
     return State(
-        pos=jnp.array(rng.uniform([0, 0, 0.1], [0, 0, 0.3], (n, 3)))[:, None],
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
-        vel=jnp.array(rng.uniform([0.5, -0.1, -0.5], [1.5, 0.1, 0], (n, 3)))[:, None],
-        omega=jnp.array(0.3 * rng.normal(size=(n, 3)))[:, None],
+        pos=jnp.asarray(rng.uniform([0, 0, 0.1], [0, 0, 0.3], (n, 3)))[:, None],
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
+        vel=jnp.asarray(rng.uniform([0.5, -0.1, -0.5], [1.5, 0.1, 0], (n, 3)))[:, None],
+        omega=jnp.asarray(0.3 * rng.normal(size=(n, 3)))[:, None],
         rpm=jnp.zeros((n, 1, 4)),
     )
 
@@ -431,7 +431,7 @@ def test_the_gradient_of_a_landing_is_unbiased_and_no_noisier_than_one_of_order_
     shorter ones to 0.3, and so did a softer onset.
     """
     sigma, n = 0.03, len(SHARE)
-    noise = sigma * jnp.array(np.random.default_rng(2).normal(size=n))
+    noise = sigma * jnp.asarray(np.random.default_rng(2).normal(size=n))
     first = np.asarray(landing_gradients(STARTS, SHARE))
     zeroth = np.asarray((landings(STARTS, SHARE + noise) - landings(STARTS, SHARE - noise)) * noise / (2 * sigma**2))
     truth = np.asarray(landings(STARTS, SHARE + sigma) - landings(STARTS, SHARE - sigma)) / (2 * sigma)

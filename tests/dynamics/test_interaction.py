@@ -41,7 +41,7 @@ probe = params.replace(rotor_pos=jnp.zeros((4, 3)))  # all rotors in the center 
 def test_forces_of_the_paper_are_the_recorded_ones(name):
     """1e-9 N and 1e-9 relative; some values are tens of newtons."""
     case = golden_data.load(name)
-    recorded = {key: jnp.array(value) for key, value in case.arrays.items()}
+    recorded = {key: jnp.asarray(value) for key, value in case.arrays.items()}
     zero = jnp.zeros_like(recorded["pos0"])
     first = State(recorded["pos0"], recorded["quat0"], recorded["vel0"], zero, recorded["rpm0"])
     second = State(recorded["pos1"], jnp.tile(jnp.array([[0.0, 0, 0, 1]]), (len(zero), 1)), zero, zero, first.rpm)
@@ -63,7 +63,7 @@ def test_the_guards_of_the_papers_downwash_leave_its_values_alone():
     assert len(dz) > 490
     off_axis = rng.uniform(-2, 2, (len(dz), 2)) * np.abs(beta)[:, None]  # where there is something to compare
     expected = -k1 * (float(params.prop_radius) / (4 * dz)) ** 2 * np.exp(-np.sum(off_axis**2, 1) / beta**2 / 2)
-    upper = jax.vmap(hovering)(jnp.array(np.column_stack([off_axis, dz])))
+    upper = jax.vmap(hovering)(jnp.asarray(np.column_stack([off_axis, dz])))
     actual = jax.vmap(lambda s: on_lower(s, pair=downwash_2021).force[2])(upper)
     np.testing.assert_allclose(actual, expected, rtol=1e-9)  # beta cancels digits near zero width: 1e-16 * 0.1 / 5e-4
 
@@ -114,7 +114,7 @@ def test_nothing_blows_upwards(pair):
 def test_the_jet_is_bounded_everywhere():
     """Nowhere faster than at its onset, 10.11 / 5.817 of the induced speed, so no rotor loses more than that share."""
     pos = np.random.default_rng(3).normal(size=(2000, 3)) * 10.0 ** np.random.default_rng(4).uniform(-6, 1, (2000, 1))
-    pos = jnp.array(np.concatenate([pos, [[0, 0, 0], [0, 0, -LENGTH]]]))
+    pos = jnp.asarray(np.concatenate([pos, [[0, 0, 0], [0, 0, -LENGTH]]]))
     force = jax.vmap(lambda p: on_lower(lower, lower.replace(pos=p), params=probe).force[2])(pos)
     largest = params.inflow_loss * INDUCED * 10.11 / 5.817 * params.weight
     assert np.all((force <= 0) & (force >= -largest))

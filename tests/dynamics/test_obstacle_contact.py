@@ -29,10 +29,10 @@ def random_states(n, seed=0):
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
     return jd.State(
-        pos=jnp.array(rng.uniform([-0.7, -0.3, -0.3], [0.6, 0.7, 0.3], (n, 3))),
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True)),
-        vel=jnp.array(rng.uniform(-3, 3, (n, 3))),
-        omega=jnp.array(rng.uniform(-10, 10, (n, 3))),
+        pos=jnp.asarray(rng.uniform([-0.7, -0.3, -0.3], [0.6, 0.7, 0.3], (n, 3))),
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True)),
+        vel=jnp.asarray(rng.uniform(-3, 3, (n, 3))),
+        omega=jnp.asarray(rng.uniform(-10, 10, (n, 3))),
         rpm=jnp.zeros((n, 4)),
     )
 
@@ -99,7 +99,7 @@ def flights_at(kind, vehicle, n, seed=0):
     starts = jax.vmap(jd.State.at_rest)(jnp.zeros((n, 1, 3))).replace(
         pos=jnp.array(aim - vel * ((radius + 0.3) / speed)[:, None] + [radius + 0.3, 0, 0])[:, None],
         vel=jnp.array(vel)[:, None],
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
     )
     thickness = jnp.array([0.02, 0.05, 0.2])[np.arange(n) % 3]
     scenes = jax.vmap(lambda t: solid(kind, t))(thickness)
@@ -122,7 +122,7 @@ def flights_at(kind, vehicle, n, seed=0):
 def test_a_thin_wall_stops_drones_at_any_speed():
     speed = np.linspace(1, 20, 16)
     starts = random_states(16).replace(
-        pos=jnp.array(np.stack([np.full(16, 0.5), np.zeros(16), np.zeros(16)], axis=1)),
+        pos=jnp.asarray(np.stack([np.full(16, 0.5), np.zeros(16), np.zeros(16)], axis=1)),
         vel=jnp.array(speed[:, None] * [1, 0.1, 0]),
     )
     thin = Scene.of(Box(pos=(1.01, 0, 0), size=(0.02, 100, 100)), ground=False)
@@ -214,8 +214,8 @@ def test_looking_only_at_what_is_within_reach_changes_nothing():
         Sphere(pos=rng.uniform(-1, 1, (20, 3)), radius=rng.uniform(0.1, 0.3, 20)),
         ground=False,
     )
-    centers = jnp.array(rng.uniform(-1, 1, (100, 1, 3)))
-    points = centers + jnp.array(0.05 * rng.normal(size=(100, 8, 3)))
+    centers = jnp.asarray(rng.uniform(-1, 1, (100, 1, 3)))
+    points = centers + jnp.asarray(0.05 * rng.normal(size=(100, 8, 3)))
     found = jit_unoptimized(jax.vmap(lambda points: heap.touched(points, 0.02)))(points)
     nearest = jit_unoptimized(jax.vmap(jax.vmap(heap.nearest)))(points)
     near = np.asarray(nearest.distance) < 0.02

@@ -75,7 +75,7 @@ def tossed(step, params, shared):
     n = len(params.mass)
     state = hovering(step, params, ABOVE[:n])
     rng = np.random.default_rng(3)
-    vel, omega = (jnp.array(size * rng.normal(size=(n, 3)), state.vel.dtype) for size in (0.3, 2.0))
+    vel, omega = (jnp.asarray(size * rng.normal(size=(n, 3)), state.vel.dtype) for size in (0.3, 2.0))
     return with_load(state.replace(vel=vel, omega=omega), vel=0.5 * rng.normal(size=(1 if shared else n, 3)))
 
 

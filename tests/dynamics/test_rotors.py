@@ -156,7 +156,7 @@ def test_turning_the_spinning_rotors_takes_the_torque_that_angular_momentum_dema
     """The torque on the body is minus the rate of h in the world, -(h' + omega x h), with h of all rotors along z."""
     params = jaxdrones.load_params("cf2x").replace(rotor_inertia=jnp.array(3e-8))
     omega, rpm, rate = np.array([1.0, -2, 3]), np.array([1e4, 2e4, 3e4, 5e4]), np.array([1e3, -2e3, 5e3, 7e3])
-    state = State(*(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3)), jnp.array(omega), jnp.array(rpm))
+    state = State(*(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3)), jnp.array(omega), jnp.asarray(rpm))
     h, h_rate = (-3e-8 * 2 * np.pi / 60 * np.sum(np.asarray(params.rotor_spin) * x) for x in (rpm, rate))
     expected = -np.array([0, 0, h_rate]) - np.cross(omega, [0, 0, h])
     torque = rotor_reaction(params, state, jnp.array(rate)).torque

@@ -28,9 +28,9 @@ def starts(worlds, near, speed):
     state = jax.vmap(jd.State.at_rest)(jnp.array(pos))
     quat = rng.normal(size=(worlds, 2, 4))
     return state.replace(
-        vel=jnp.array(speed * rng.uniform(-1, 1, (worlds, 2, 3))),
-        omega=jnp.array(rng.uniform(-9, 9, (worlds, 2, 3))),
-        quat=jnp.array(quat / np.linalg.norm(quat, axis=2, keepdims=True)),
+        vel=jnp.asarray(speed * rng.uniform(-1, 1, (worlds, 2, 3))),
+        omega=jnp.asarray(rng.uniform(-9, 9, (worlds, 2, 3))),
+        quat=jnp.asarray(quat / np.linalg.norm(quat, axis=2, keepdims=True)),
     )
 
 
@@ -80,7 +80,7 @@ def test_what_stays_in_its_free_ball_has_no_contact():
         wrench = jax.vmap(jd.obstacle_contact, (0, 0, None))(one, moved, SCENE)
         return free.hold(one, moved)[0], jnp.any(wrench.force != 0), free.radius[0]
 
-    towards = jnp.array(np.random.default_rng(1).normal(size=(400, 1, 3)) * 0.2)
+    towards = jnp.asarray(np.random.default_rng(1).normal(size=(400, 1, 3)) * 0.2)
     inside, touched, radius = jit_unoptimized(jax.vmap(of_world))(states, towards)
     assert 50 < jnp.sum(inside) < 350 and jnp.sum(touched) > 10
     assert not np.any(inside & touched)

@@ -19,12 +19,12 @@ make_step = lru_cache(lambda dt, substeps=1: jaxdrones.make_step(dt=dt, substeps
 @pytest.mark.parametrize("name", golden_data.names(kind="open_loop_rollout", physics="dyn", variant="main"))
 def test_whole_rollouts_agree(name):
     case = golden_data.load(name)
-    pos, quat, vel, omega = (jnp.array(case.arrays[key]) for key in ("pos", "quat", "vel", "body_rates"))
+    pos, quat, vel, omega = (jnp.asarray(case.arrays[key]) for key in ("pos", "quat", "vel", "body_rates"))
     start = State(pos[0], quat[0], vel[0], omega[0], jnp.zeros((len(pos[0]), 4)))
     params, rpm = golden_data.flown(case, golden_data.explicit_params(case))
     step = make_step(1 / case.about["physics_freq_hz"], case.about["physics_steps_per_record"])
-    flown = fly(step, jaxdrones.repeat(params, len(pos[0])), start, jnp.array(rpm))
-    applied = jnp.array(case.arrays["rpm_applied"])
+    flown = fly(step, jaxdrones.repeat(params, len(pos[0])), start, jnp.asarray(rpm))
+    applied = jnp.asarray(case.arrays["rpm_applied"])
     assert_same_motion(flown, State(pos[1:], quat[1:], vel[1:], omega[1:], applied), ATOL)
 
 
@@ -32,9 +32,9 @@ def test_whole_rollouts_agree(name):
 def test_single_steps_agree(name):
     case = golden_data.load(name)
     pos, quat, vel, omega = (
-        jnp.array(case.arrays[key]) for key in ("pos_out", "quat_out", "vel_out", "body_rates_out")
+        jnp.asarray(case.arrays[key]) for key in ("pos_out", "quat_out", "vel_out", "body_rates_out")
     )
-    assert_same_motion(_one_step(case), State(pos, quat, vel, omega, jnp.array(case.arrays["rpm"])), ATOL)
+    assert_same_motion(_one_step(case), State(pos, quat, vel, omega, jnp.asarray(case.arrays["rpm"])), ATOL)
 
 
 @pytest.mark.parametrize("name", golden_data.names("pos_in", physics="dyn", variant="paper"))
@@ -42,8 +42,8 @@ def test_single_steps_of_the_paper_agree_in_velocity_and_body_rates(name):
     """Its attitudes take body rates for rates of Euler angles and are not ours."""
     case = golden_data.load(name)
     stepped = _one_step(case)
-    assert_close(stepped.vel, jnp.array(case.arrays["vel_out"]), ATOL)
-    assert_close(stepped.omega, jnp.array(case.arrays["body_rates_out"]), ATOL)
+    assert_close(stepped.vel, jnp.asarray(case.arrays["vel_out"]), ATOL)
+    assert_close(stepped.omega, jnp.asarray(case.arrays["body_rates_out"]), ATOL)
 
 
 @pytest.mark.float32
@@ -61,7 +61,7 @@ def test_single_steps_agree_in_float32(name):
 
 def _one_step(case):
     """All samples at once: a team of drones that do not feel each other."""
-    inputs = (jnp.array(case.arrays[f"{key}_in"]) for key in ("pos", "quat", "vel", "body_rates"))
-    rpm = jnp.array(case.arrays["rpm"])
+    inputs = (jnp.asarray(case.arrays[f"{key}_in"]) for key in ("pos", "quat", "vel", "body_rates"))
+    rpm = jnp.asarray(case.arrays["rpm"])
     team = jaxdrones.repeat(golden_data.unlimited(golden_data.explicit_params(case)), len(rpm))
     return make_step(case.about["dt"])(team, State(*inputs, jnp.zeros_like(rpm)), rpm)

@@ -80,7 +80,7 @@ def directions(arguments):
     for i, (path, leaf) in enumerate(leaves):
         size = np.where(leaf == 0, np.max(np.abs(leaf)) or 1.0, np.abs(leaf))
         chosen = list(zeros)
-        chosen[i] = jnp.array(rng.uniform(-1, 1, leaf.shape) * size)
+        chosen[i] = jnp.asarray(rng.uniform(-1, 1, leaf.shape) * size)
         yield jax.tree_util.keystr(path), jax.tree_util.tree_unflatten(structure, chosen)
 
 

@@ -231,8 +231,8 @@ def test_gradients_of_the_return_equal_central_differences_before_a_gate():
 
 def check_gradient(env, world, steps=10, eps=1e-6):
     rng = np.random.default_rng(0)
-    actions = jnp.array(rng.uniform(-0.4, 0.4, (steps, env.drones, env.action_size)))
-    direction = jnp.array(rng.normal(size=actions.shape))
+    actions = jnp.asarray(rng.uniform(-0.4, 0.4, (steps, env.drones, env.action_size)))
+    direction = jnp.asarray(rng.normal(size=actions.shape))
 
     @jax.jit
     def returned(actions):

@@ -105,9 +105,9 @@ def seen(env, *batch: int):
     rng = np.random.default_rng(0)
     shape = (*batch, env.drones)
     return {
-        "state": jnp.array(rng.normal(size=(*shape, env.observation_size))),
-        "rgb": jnp.array(rng.integers(0, 256, (*shape, 48, 64, 4)), jnp.uint8),
-        "depth": jnp.array(rng.uniform(0, 10, (*shape, 48, 64)), jnp.float32),
+        "state": jnp.asarray(rng.normal(size=(*shape, env.observation_size))),
+        "rgb": jnp.asarray(rng.integers(0, 256, (*shape, 48, 64, 4)), jnp.uint8),
+        "depth": jnp.asarray(rng.uniform(0, 10, (*shape, 48, 64)), jnp.float32),
     }
 
 

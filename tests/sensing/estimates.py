@@ -19,8 +19,8 @@ def flights(n, hz, seconds, *, lag=False, seed=0):
     rotors = dict(rotors=jd.lagging_rotors) if lag else {}
     step = jd.make_step(effects=(jd.drag,), integrator=jd.rk4, dt=1 / hz, **rotors)
     rng = np.random.default_rng(seed)
-    radius, turn = jnp.array(rng.uniform(0.2, 1, n)), jnp.array(rng.uniform(0, 2 * np.pi, n))
-    speed = jnp.array(rng.uniform(0.5, 2, n)) / jnp.sqrt(radius)
+    radius, turn = jnp.asarray(rng.uniform(0.2, 1, n)), jnp.asarray(rng.uniform(0, 2 * np.pi, n))
+    speed = jnp.asarray(rng.uniform(0.5, 2, n)) / jnp.sqrt(radius)
     gains = geometric.gains()
     if lag:
         gains = gains.replace(attitude=gains.attitude / 4, rate=gains.rate / 2)

@@ -53,7 +53,7 @@ def test_an_imu_feels_thrust_and_drag_and_the_turn_at_its_place(flown):
 def random_state(seed):
     """State of one drone, any attitude, and a time derivative of it."""
     rng = np.random.default_rng(seed)
-    quat, vel, omega, acc, omega_rate = (jnp.array(rng.normal(size=n)) for n in (4, 3, 3, 3, 3))
+    quat, vel, omega, acc, omega_rate = (jnp.asarray(rng.normal(size=n)) for n in (4, 3, 3, 3, 3))
     state = jd.State(jnp.zeros(3), jd.rotation.normalize(quat), vel, 3 * omega, jnp.zeros(4))
     rate = jax.tree.map(jnp.zeros_like, state).replace(vel=acc, omega=5 * omega_rate, quat=quat_rate(state))
     return state, rate

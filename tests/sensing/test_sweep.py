@@ -23,7 +23,7 @@ def random_ways(n, seed=0):
     """Starts and ends of a disc, 0.2 m from each other, that begins outside and comes near the origin."""
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
-    axis = jax.vmap(rotation.z_axis)(jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True)))
+    axis = jax.vmap(rotation.z_axis)(jnp.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True)))
     start = rng.normal(size=(n, 3))
     start *= rng.uniform(0.28, 0.4, (n, 1)) / np.linalg.norm(start, axis=1, keepdims=True)
     way = rng.uniform(-0.15, 0.15, (n, 3)) - start

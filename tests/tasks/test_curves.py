@@ -37,7 +37,7 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_curve(curve):
 
 @pytest.mark.parametrize("shape", curves.SHAPES.values())
 def test_shapes_repeat_after_a_period_and_stay_within_their_size(shape):
-    u = jnp.array(np.random.default_rng(0).uniform(-1, 1, curves.RANDOM_NUMBERS))
+    u = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, curves.RANDOM_NUMBERS))
     s = jnp.linspace(0, 1, 100, endpoint=False)
     along = jax.jit(jax.vmap(shape, (None, 0)))
     np.testing.assert_allclose(along(u, s), along(u, s + 2), atol=1e-12)

@@ -23,6 +23,7 @@ def world_with(offset, yaw=0.0):
 
 
 def test_a_drone_is_in_view_where_the_camera_shows_it():
+    in_view = jit_unoptimized(lambda world: ENV().task.metrics["in_view"](ENV().task, world))
     half = np.tan(np.radians(30))  # of the vertical field of view
     for offset, seen in [
         ((2, 0, 0), 1),
@@ -32,8 +33,8 @@ def test_a_drone_is_in_view_where_the_camera_shows_it():
         ((2, -1.9 * half * 4 / 3, 0), 1),
         ((2, 2.1 * half * 4 / 3, 0), 0),
     ]:
-        assert ENV().task.metrics["in_view"](ENV().task, world_with(offset)).tolist() == [1, seen, 1]
-    assert ENV().task.metrics["in_view"](ENV().task, world_with((-2, 0, 0), yaw=np.pi))[1] == 1
+        assert in_view(world_with(offset)).tolist() == [1, seen, 1]
+    assert in_view(world_with((-2, 0, 0), yaw=np.pi))[1] == 1
 
 
 def test_what_is_out_of_sight_costs_one_minus_the_cosine_from_the_axis_of_the_camera():
@@ -44,24 +45,27 @@ def test_what_is_out_of_sight_costs_one_minus_the_cosine_from_the_axis_of_the_ca
 
 
 def test_a_follower_should_be_at_its_distance_on_the_level_line_to_the_drone_before_it():
-    world = world_with((4.0, 0.0, 1.0))
-    np.testing.assert_allclose(ENV().task.target_now(world).pos[1:], [[3.5, 2, 4], [-0.5, 2, 3]], atol=1e-12)
-    np.testing.assert_allclose(
-        ENV().task.metrics["distance_error"](ENV().task, world), [0, np.sqrt(17) - 1.5, 1.5], atol=1e-12
-    )
+    task, world = ENV().task, world_with((4.0, 0.0, 1.0))
+    places, errors = jit_unoptimized(
+        lambda world: (task.target_now(world).pos, task.metrics["distance_error"](task, world))
+    )(world)
+    np.testing.assert_allclose(places[1:], [[3.5, 2, 4], [-0.5, 2, 3]], atol=1e-12)
+    np.testing.assert_allclose(errors, [0, np.sqrt(17) - 1.5, 1.5], atol=1e-12)
 
 
 def test_a_follower_is_told_the_direction_of_the_drone_before_it_in_its_own_axes():
-    line = ENV().task.observations["line_of_sight"].observe(ENV().task, world_with((0.0, 4.0, 3.0), yaw=np.pi / 2))
+    observe = jit_unoptimized(lambda world: ENV().task.observations["line_of_sight"].observe(ENV().task, world))
+    line = observe(world_with((0.0, 4.0, 3.0), yaw=np.pi / 2))
     np.testing.assert_allclose(line, [[0, 0, 0], [0.8, 0, 0.6], [0, -1, 0]], atol=1e-12)
 
 
 def test_a_follower_that_passes_through_another_drone_between_two_control_steps_has_touched_it():
     """Eight meters a second: 40 cm in a control step at 20 Hz."""
     world = world_with((0.2, 0.0, 0.0))
+    touched_in = jit_unoptimized(lambda world: ENV().task.advance(ENV().task, world)["touched"])
     radius = float(world.params.collision_radius[0])
     for gap, touched in ((1.9, True), (2.1, False)):
         pos = world.drones.pos + np.array([[0, 0, 0], [0.4, gap * radius, 0], [0, 0, 0]])
         before = world.drones.pos + np.array([[0, 0, 0], [0, gap * radius, 0], [0, 0, 0]])
         now = world.replace(drones=world.drones.replace(pos=pos), variables=world.variables | {"pos": before})
-        np.testing.assert_array_equal(ENV().task.advance(ENV().task, now)["touched"], [touched, touched, False])
+        np.testing.assert_array_equal(touched_in(now), [touched, touched, False])

@@ -56,14 +56,15 @@ def test_the_time_penalty_costs_every_step_and_a_crash_sixty_of_them():
     """Until the drone has passed the last gate, in the step after which nothing is charged."""
     hurried, last = make("gates", time_penalty=0.5), len(GATES) - 1
     into = OPENING / 2 + FRAME / 2
+
+    @jit_unoptimized
+    def cost(world):
+        return [sum(w * term(env.task, world) for w, term in env.task.rewards.values()) for env in (ENV(), hurried)]
+
     for aside, index, penalty in ((0.0, 0, 0.5), (0.0, last, 0.5), (0.0, last + 1, 0), (into, 0, 0.5 + 60 * 0.5)):
         gate = GATES[min(index, last)]
         after = moved(in_gate(aside * LEFT - THROUGH, gate), in_gate(aside * LEFT + 0.05 * THROUGH, gate), index)
-        world = start_of_race().replace(variables=after)
-        plain, less = (
-            sum(weight * term(env.task, world) for weight, term in env.task.rewards.values())
-            for env in (ENV(), hurried)
-        )
+        plain, less = cost(start_of_race().replace(variables=after))
         np.testing.assert_allclose(plain - less, penalty, rtol=1e-6)
 
 

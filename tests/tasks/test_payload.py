@@ -86,13 +86,18 @@ def test_the_swing_is_the_angle_from_the_vertical_to_the_middle_of_the_team():
 def test_drones_at_their_places_have_no_penalty_and_carry_the_load_at_rest():
     """The places of a team are equal cables apart from the load, and its thrust holds a load where it is."""
     env = make("transport", drones=3)
-    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
-    places = world.drones.pos + env.task.observations["place"].observe(env.task, world)
-    apart = places - load_of(world).pos
-    np.testing.assert_allclose(jnp.linalg.norm(apart, axis=-1), 0.5, rtol=1e-5)
-    np.testing.assert_allclose(jnp.mean(apart, axis=0)[:2], 0, atol=1e-6)
-    there = world.replace(drones=world.drones.replace(pos=places))
-    np.testing.assert_allclose(env.task.rewards["place"][1](env.task, there), 0, atol=1e-4)
+
+    @jit_unoptimized
+    def at_their_places(key):
+        _, world = env.reset(key)
+        places = world.drones.pos + env.task.observations["place"].observe(env.task, world)
+        there = world.replace(drones=world.drones.replace(pos=places))
+        return places - load_of(world).pos, env.task.rewards["place"][1](env.task, there)
+
+    apart, penalty = at_their_places(jax.random.key(0))
+    np.testing.assert_allclose(np.linalg.norm(apart, axis=-1), 0.5, rtol=1e-5)
+    np.testing.assert_allclose(np.mean(apart, axis=0)[:2], 0, atol=1e-6)
+    np.testing.assert_allclose(penalty, 0, atol=1e-4)
 
 
 def test_success_is_an_rms_error_below_10_cm_and_a_largest_swing_below_15_degrees_after_a_second():

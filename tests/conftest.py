@@ -23,6 +23,8 @@ import jax
 import jaxtyping
 import pytest
 import shapes
+from jax._src import pjit
+from jax._src.interpreters import pxla
 
 PACKAGE = Path(importlib.util.find_spec("jaxdrones").submodule_search_locations[0])
 MODULES = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
@@ -62,3 +64,12 @@ def pytest_runtest_call(item):
 def precision(request):
     with jax.enable_x64(request.node.get_closest_marker("float32") is None):
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def lowered():
+    """Forget lowered programs, not compiled ones: beside a thousand of them, lowering takes three times as long."""
+    yield
+    for module, name in ((pjit, "_pjit_lower"), (pxla, "_cached_lowering_to_hlo")):
+        if hasattr(module, name):  # not promised by JAX
+            getattr(module, name).cache_clear()

@@ -71,7 +71,7 @@ def _computed(*inputs: Array, program: Any, mapped: tuple[bool, ...], worlds: in
     def many(same: Sequence[Array], varying: Sequence[Array]) -> list[Array]:
         found = {True: iter([jnp.moveaxis(x, 0, -1) for x in varying]), False: iter(same)}
         last = [next(found[varies]) for varies in mapped]
-        results = over_last_axis(program, last, mapped, by_numbers=_by_numbers(program))
+        results = over_last_axis(program, last, mapped, _by_numbers(program))
         return [jnp.moveaxis(x, -1, 0) for x in results]
 
     same, varying = ([x for x, varies in zip(inputs, mapped, strict=True) if varies == wanted] for wanted in (0, 1))

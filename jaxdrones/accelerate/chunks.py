@@ -78,7 +78,9 @@ class ChunkedProgram:
 
         def of_worlds(consts, leaves):
             last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
-            return [jnp.moveaxis(x, -1, 0) for x in over_last_axis(self.program, last, [True] * len(last), consts)]
+            by_numbers = fits_number_by_number(self.program)
+            results = over_last_axis(self.program, last, [True] * len(last), by_numbers, consts)
+            return [jnp.moveaxis(x, -1, 0) for x in results]
 
         @jax.custom_jvp
         def flown(consts, leaves):

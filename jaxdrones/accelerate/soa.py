@@ -24,7 +24,6 @@ from jaxdrones.accelerate.fitting import (
     REDUCTIONS,
     SHAPES,
     NoKernelError,
-    fits_number_by_number,
     iterations_at_once,
 )
 from jaxdrones.accelerate.layout import Value, Whole, apart, number_by_number, of_numbers, product, reduced, whole
@@ -36,20 +35,16 @@ _RULES = dict.fromkeys(REDUCTIONS, reduced) | dict.fromkeys(PRODUCTS, product) |
 
 
 def over_last_axis(
-    program: Any,
-    inputs: Sequence[Array],
-    varies: Sequence[bool],
-    consts: Sequence[Array] = (),
-    by_numbers: bool | None = None,
+    program: Any, inputs: Sequence[Array], varies: Sequence[bool], by_numbers: bool, consts: Sequence[Array] = ()
 ) -> list[Array]:
     """Evaluate a program of one world in a form for kernels, with the worlds last in the results and varying inputs.
 
-    By default it is computed number by number if it `fits_number_by_number`, otherwise array by array.
+    It is computed number by number, or array by array.
 
     Raises:
         NoKernelError: the program cannot be a single kernel.
     """
-    if not (fits_number_by_number(program) if by_numbers is None else by_numbers):
+    if not by_numbers:
         axes = [-1 if each else None for each in varies]
         return jax.vmap(functools.partial(store_reordered, program, consts, rules=_RULES), axes, -1)(*inputs)
     worlds = next(x.shape[-1] for x, each in zip(inputs, varies, strict=True) if each)

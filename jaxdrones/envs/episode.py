@@ -43,7 +43,8 @@ def in_full_precision(function: Callable[P, R]) -> Callable[P, R]:
 
 def check_period(env: Any) -> None:
     """Raise unless a step of the physics takes one control period, and a camera takes no more than one image in it."""
-    _ = env.vision and env.vision.every(env.dt)
+    if env.vision:
+        env.vision.every(env.dt)
     period = env.physics.period
     if period is not None and not math.isclose(period, env.dt, rel_tol=1e-6):
         raise UserError(

@@ -112,7 +112,7 @@ def test_what_it_closes_over_may_be_traced():
     [(3, 3, jnp.sort, False), (50, 3, jnp.negative, True), (36, 400, jnp.negative, True)],
     ids=["sorting", "large arrays", "many arrays, which would compile for long number by number"],
 )
-def test_what_cannot_be_apart_is_as_vmap_computes_it(size, length, each, kernel):
+def test_what_is_not_computed_number_by_number_is_as_vmap_computes_it(size, length, each, kernel):
     """Sorting by several kernels; large and many arrays in one kernel, array by array."""
     x = jnp.asarray(rng.normal(size=(4, size)))
 

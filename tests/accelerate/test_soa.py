@@ -10,7 +10,7 @@ from helpers import flying, tape
 
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.fitting import can_be_a_kernel
+from jaxdrones.accelerate.fitting import can_be_a_kernel, fits_number_by_number
 from jaxdrones.accelerate.soa import over_last_axis
 
 rng = np.random.default_rng(0)
@@ -25,7 +25,9 @@ def vmap_apart(function):
         leaves, tree = jax.tree.flatten(arguments)
         of_one = [jax.ShapeDtypeStruct(x.shape[:-1], x.dtype) for x in leaves]
         program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one)
-        return jax.tree.structure(shape).unflatten(over_last_axis(program, leaves, [True] * len(leaves), consts))
+        varies, by_numbers = [True] * len(leaves), fits_number_by_number(program)
+        results = over_last_axis(program, leaves, varies, by_numbers, consts)
+        return jax.tree.structure(shape).unflatten(results)
 
     return many
 

@@ -121,18 +121,19 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 
-def stop_at(state: State, normals: Float[Array, "planes 3"], heights: Float[Array, " planes"]) -> State:
-    """Project the state of a drone onto the half spaces n . pos >= h: move it back and remove the approach velocity.
+def stop_at(
+    pos: Float[Array, "3"], vel: Float[Array, "3"], normals: Float[Array, "planes 3"], heights: Float[Array, " planes"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Project position and velocity of a drone onto the half spaces n . pos >= h: no depth and no approach.
 
     The impact is inelastic and without spin, so it adds no energy; compliant contact does the rest. The `normals` n are
     unit vectors, world, or zero for no plane; the `heights` are h, m.
     """
-    pos, vel = state.pos, state.vel
     for normal, height in zip(normals, heights, strict=True):
         behind = height - dot(normal, pos)
         pos += jnp.maximum(behind, 0) * normal
         vel -= jnp.where(behind > 0, jnp.minimum(dot(vel, normal), 0), 0) * normal
-    return state.replace(pos=pos, vel=vel)
+    return pos, vel
 
 
 def contact_radius(params: Params) -> Float[Array, ""]:

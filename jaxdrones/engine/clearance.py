@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones.accelerate.stored import stored
-from jaxdrones.accelerate.where_needed import in_all_worlds, where_needed
+from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.checks import bind
 from jaxdrones.dynamics.contact import contact_radius, rim, stop_at
 from jaxdrones.engine.physics import Contact
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.distances import merged
-from jaxdrones.sensing.sweep import Disc, Planes, planes
+from jaxdrones.sensing.sweep import Disc, planes
 from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt
 from jaxdrones.wrench import Wrench
@@ -67,18 +67,19 @@ class NearObstacles:
         self._contacts, self._scene, self._free = contacts, scene, stored(FreeBalls.about(state, scene))
 
     def step(self, params: Params, before: State, advance: Callable[[Contact], State]) -> State:
-        """Team after a physics step among the obstacles, by `advance(contact)`: that after a step with this contact.
+        """Team after a physics step, by `advance(contact)`, with no drone inside or behind an obstacle, at any speed.
 
-        Where no drone leaves its ball in any world, this is the unobstructed step, and so is its derivative.
+        Compliant contact yields, and depends on the start of a step alone, so the path of every step is swept. The
+        stopping planes are constants of the gradient: it is exact for flat obstacles, and neglects the curvature of
+        round obstacles and derivatives with respect to the obstacles' poses.
         """
-        unobstructed = advance(_no_contact)
-        still = jax.lax.stop_gradient((params, before, unobstructed))
-        clear = jnp.all(self._free.hold(*still[:2]) & self._free.hold(still[0], still[2]))
-
-        def among_obstacles() -> State:
-            return self._stopped(params, before, advance(self._contact))
-
-        return jax.lax.cond(in_all_worlds(clear), lambda: unobstructed, among_obstacles)
+        after = advance(self._contact)
+        still = jax.lax.stop_gradient((params, before, after))
+        is_free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
+        path = jax.vmap(_core)(*still[:2]), jax.vmap(_core)(params, after)
+        free = after.pos, after.vel
+        pos, vel = where_needed(_stopped, _ONE_IN)(~jnp.all(is_free), *path, *free, self._scene, otherwise=free)
+        return after.replace(pos=pos, vel=vel)
 
     def _contact(self, params: Params, state: State) -> Wrench:
         """Wrench of the obstacles on every drone of a team."""
@@ -90,32 +91,19 @@ class NearObstacles:
         still = jax.lax.stop_gradient((params, state))
         return where_needed(on_all, _ONE_IN)(~jnp.all(self._free.hold(*still)), params, state, self._scene)
 
-    def _stopped(self, params: Params, before: State, after: State) -> State:
-        """Team at the end of a physics step, with no drone inside or behind an obstacle, at any speed.
 
-        Compliant contact yields, and depends on the start of a step alone, so the path of every step is swept. The
-        stopping planes are constants of the gradient: it is exact for flat obstacles, and neglects the curvature of
-        round obstacles and derivatives with respect to the obstacles' poses. `after` is the end of an unobstructed
-        step.
-        """
+def _stopped(
+    start: Disc, end: Disc, pos: Float[Array, "n 3"], vel: Float[Array, "n 3"], scene: Scene
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Positions and velocities of a team that the obstacles stop on its way; arguments of unobstructed drones."""
+    kinds = merged(scene.shapes(pos.dtype))
 
-        def find(params: Params, before: State, after: State, scene: Scene) -> Planes:
-            kinds = merged(scene.shapes(before.pos.dtype))
-            start, end = jax.vmap(_core)(params, before), jax.vmap(_core)(params, after)
-            return jax.vmap(lambda *way: planes(kinds, *way))(start, end)
+    def of_drone(start: Disc, end: Disc, pos: Float[Array, "3"], vel: Float[Array, "3"]) -> tuple[Array, Array]:
+        normals, heights = planes(kinds, *jax.lax.stop_gradient((start, end)))
+        below = jnp.stack([dot(normal, pos) - end.lowest(normal) for normal in normals])
+        return stop_at(pos, vel, normals, heights + below)
 
-        def stop(params: Params, state: State, planes: Planes) -> State:
-            core = _core(params, state)
-            below = [dot(normal, state.pos) - core.lowest(normal) for normal in planes.normals]
-            return stop_at(state, planes.normals, planes.heights + jnp.stack(below))
-
-        still = jax.lax.stop_gradient((params, before, after, self._scene))
-        free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
-        return jax.vmap(stop)(params, after, where_needed(find, _ONE_IN)(~jnp.all(free), *still))
-
-
-def _no_contact(params: Params, state: State) -> Wrench:
-    return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
+    return jax.vmap(of_drone)(start, end, pos, vel)
 
 
 def _core(params: Params, state: State) -> Disc:

@@ -120,8 +120,11 @@ def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> tuple[Bool[Array, "
         on_disc = disc.nearest(on_obstacle)
         return on_obstacle, on_disc, obstacle.distance(on_disc) - disc.rounding
 
-    def advance(_, carry: tuple) -> tuple:
-        share, on_obstacle, _, _ = carry
+    def is_on_the_way(carry: tuple) -> Bool[Array, ""]:
+        return (carry[0] < _ADVANCES) & (carry[1] < 1)
+
+    def advance(carry: tuple) -> tuple:
+        count, share, on_obstacle, _, _ = carry
         now = start._replace(center=start.center + share * way)
         on_obstacle, on_disc, gap = nearest(now, on_obstacle)
         normal = obstacle.outward(on_disc)
@@ -129,11 +132,11 @@ def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> tuple[Bool[Array, "
         closing = -dot(way, normal)
         passes = closing <= 0
         more = jnp.where(passes, 1, jnp.maximum(now.lowest(normal) - height, 0) / jnp.where(passes, 1, closing))
-        return jnp.minimum(share + more, 1), on_obstacle, normal, height
+        return count + 1, jnp.minimum(share + more, 1), on_obstacle, normal, height
 
     zero = jnp.zeros_like(start.rounding)
-    begin = zero, obstacle.nearest(start.center), jnp.zeros_like(way), zero
-    share, _, normal, height = jax.lax.fori_loop(0, _ADVANCES, advance, begin)
+    begin = jnp.zeros((), jnp.int32), zero, obstacle.nearest(start.center), jnp.zeros_like(way), zero
+    _, share, _, normal, height = jax.lax.while_loop(is_on_the_way, advance, begin)
     touches = (share < 1) | (nearest(end, obstacle.nearest(end.lowest_point(normal)))[2] < 0)
     normal = rotation.rotate(obstacle.quat, normal)
     return touches, normal, height + dot(obstacle.pos, normal)

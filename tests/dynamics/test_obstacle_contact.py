@@ -228,11 +228,11 @@ def test_looking_only_at_what_is_within_reach_changes_nothing():
 @pytest.mark.parametrize(("toward", "kept"), [(-2.0, 0.0), (3.0, 3.0)])
 def test_a_plane_takes_the_velocity_toward_it_and_no_other(toward, kept):
     normal, along = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.8, 0.0, -0.6])
-    state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3)))).replace(vel=toward * normal + 5 * along)
-    stopped = stop_at(state, jnp.stack([normal, jnp.zeros(3)]), jnp.array([0.01, 0.0]))
-    np.testing.assert_allclose(stopped.vel, kept * normal + 5 * along, atol=1e-12)
-    np.testing.assert_allclose(stopped.pos, 0.01 * normal, atol=1e-12)
-    np.testing.assert_array_equal(stop_at(state, normal[None], jnp.array([-0.01])).vel, state.vel)
+    pos, vel = jnp.zeros(3), toward * normal + 5 * along
+    stopped_pos, stopped_vel = stop_at(pos, vel, jnp.stack([normal, jnp.zeros(3)]), jnp.array([0.01, 0.0]))
+    np.testing.assert_allclose(stopped_vel, kept * normal + 5 * along, atol=1e-12)
+    np.testing.assert_allclose(stopped_pos, 0.01 * normal, atol=1e-12)
+    np.testing.assert_array_equal(stop_at(pos, vel, normal[None], jnp.array([-0.01]))[1], vel)
 
 
 SPHERE = Sphere(pos=(0.5, 0.01, 1.0), radius=0.3)

@@ -86,7 +86,7 @@ def deepest(params, states, scene):
     return jnp.max(jnp.stack([jax.vmap(depth)(pos, states.quat[1:]) for pos in between]))
 
 
-def flights_at(kind, vehicle, n, seed=0):
+def flights_at(kind, vehicle, n, seed=0, max_rate=0.0, step=step):
     """Depths, gains of energy and trajectories of n drones without weight that fly at a solid at 1 to 20 m/s."""
     rng = np.random.default_rng(seed)
     params = jd.load_params(vehicle).replace(gravity=jnp.zeros(()))
@@ -94,11 +94,13 @@ def flights_at(kind, vehicle, n, seed=0):
     quat[::2] = 0, 0, 0, 1
     speed, radius = np.linspace(1, 20, n), float(params.collision_radius)
     vel = speed[:, None] * np.stack([np.ones(n), *rng.uniform(-0.2, 0.2, (2, n))], axis=1)
+    omega = max_rate * np.random.default_rng(seed).uniform(-1, 1, (n, 3))
     aim = np.array([-radius - 0.3, 0, 0]) * np.ones((n, 1))
     aim[:, 1:] = rng.uniform(-0.5, 0.5, (n, 2)) * radius + (kind == "gate") * np.array([[0.225, 0]])
     starts = jax.vmap(jd.State.at_rest)(jnp.zeros((n, 1, 3))).replace(
         pos=jnp.array(aim - vel * ((radius + 0.3) / speed)[:, None] + [radius + 0.3, 0, 0])[:, None],
         vel=jnp.array(vel)[:, None],
+        omega=jnp.array(omega)[:, None],
         quat=jnp.asarray(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
     )
     thickness = jnp.array([0.02, 0.05, 0.2])[np.arange(n) % 3]
@@ -113,7 +115,7 @@ def flights_at(kind, vehicle, n, seed=0):
 
         states = jax.tree.map(lambda x: x[:, 0], jax.lax.scan(advance, start, length=96)[1])
         energy = params.mass * jnp.sum(states.vel**2, axis=1) + states.omega**2 @ params.inertia
-        first = params.mass * jnp.sum(start.vel**2)
+        first = params.mass * jnp.sum(start.vel**2) + jnp.sum(start.omega**2 @ params.inertia)
         return deepest(params, states, scene), jnp.max(energy) / first, states
 
     return flown(starts, scenes)
@@ -145,6 +147,17 @@ def test_nothing_flies_into_a_solid_however_thin_it_is_and_no_energy_is_gained(k
     assert_finite(states)
     assert depths.max() < 0.01
     assert gains.max() < 1.001
+
+
+@pytest.mark.float32
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wall", "cylinder", "gate"])
+def test_contact_gives_spinning_drones_no_energy(kind):
+    """By an integrator that conserves the energy of a free spin."""
+    midpoint = jd.make_step(effects=(jd.obstacle_contact,), integrator=jd.dynamics.INTEGRATORS["implicit_midpoint"])
+    depths, gains, _ = flights_at(kind, "x500", n=24, max_rate=10.0, step=midpoint)
+    assert depths.max() < 0.01
+    assert 0.99 < gains.max() < 1 + 1e-5
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)

@@ -25,7 +25,7 @@ def signed_distance(beyond: Float[Array, " n"]) -> Number:
 
     Its gradient on a face is that of inside.
     """
-    inside = jnp.max(beyond)
+    inside = functools.reduce(jnp.maximum, components(beyond))
     return length(jnp.maximum(beyond, 0)) + jnp.where(inside > 0, 0, inside)
 
 

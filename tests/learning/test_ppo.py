@@ -98,3 +98,24 @@ def test_a_step_is_followed_by_the_next_one_or_by_what_was_seen_last(monkeypatch
     following = np.array([[2, 101], [0, 5], [6, 105], [106, 107]])  # 0 after a termination
     np.testing.assert_allclose(found.value_target[..., 0], 1 + 0.5 * following)
     np.testing.assert_array_equal(found.starts, [[0, 0], [0, 1], [1, 0], [0, 1]])
+
+
+def test_no_noise_of_an_update_is_used_twice(monkeypatch):
+    """The actions of the trajectory and those with which the critic is bootstrapped are drawn independently."""
+    env = SimpleNamespace(drones=2, action_size=3, steps=5, task=SimpleNamespace(truncations=(), ends="team"))
+    config, drawn = ppo.Config(worlds=4, horizon=12, minibatches=2), []
+    state = ppo.TrainState(0, jax.random.key(0), None, None, None, jnp.zeros(3), None, None)
+
+    def learn(state, hidden_state, trajectory, noise):
+        drawn.append(noise)
+        raise StopIteration
+
+    for name in ("draw_starts", "progress_of"):
+        monkeypatch.setattr(ppo.collect, name, lambda *_: None)
+    monkeypatch.setattr(ppo.collect, "restart", lambda *_: SimpleNamespace(hidden_state=None))
+    monkeypatch.setattr(ppo.collect, "collect", lambda *_, noise, **__: (None, drawn.append(noise)))
+    monkeypatch.setattr(ppo.sharding, "map_worlds", lambda *_: learn)
+    with pytest.raises(StopIteration):
+        ppo.update(env, config, state)
+    assert [x.shape for x in drawn] == [(12, 4, 2, 3), (4, 4, 2, 3)]  # at most 3 truncations, and the last step
+    assert len(np.unique(np.concatenate(drawn))) == 16 * 4 * 2 * 3

@@ -77,8 +77,10 @@ class NearObstacles:
         still = jax.lax.stop_gradient((params, before, after))
         is_free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
         path = jax.vmap(_core)(*still[:2]), jax.vmap(_core)(params, after)
-        free = after.pos, after.vel
-        pos, vel = where_needed(_stopped, _ONE_IN)(~jnp.all(is_free), *path, *free, self._scene, otherwise=free)
+        unobstructed = after.pos, after.vel
+        stopped = where_needed(_stopped, _ONE_IN)
+        needed = ~jnp.all(is_free)
+        pos, vel = stopped(needed, *path, *unobstructed, self._scene, otherwise=unobstructed)
         return after.replace(pos=pos, vel=vel)
 
     def _contact(self, params: Params, state: State) -> Wrench:

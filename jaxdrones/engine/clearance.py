@@ -97,7 +97,7 @@ class NearObstacles:
 def _stopped(
     start: Disc, end: Disc, pos: Float[Array, "n 3"], vel: Float[Array, "n 3"], scene: Scene
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Positions and velocities of a team that the obstacles stop on its way; arguments of unobstructed drones."""
+    """Positions and velocities of a team whose drones obstacles stop; `end`, `pos` and `vel` are those without them."""
     kinds = merged(scene.shapes(pos.dtype))
 
     def of_drone(start: Disc, end: Disc, pos: Float[Array, "3"], vel: Float[Array, "3"]) -> tuple[Array, Array]:

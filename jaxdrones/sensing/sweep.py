@@ -18,7 +18,7 @@ from jaxdrones.sensing.geometry import Number, Point, length
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import dot, safe_sqrt
 
-_ADVANCES = 8  # at most; most bodies arrive with the first one
+_ADVANCES = 8  # at most
 _PROJECTIONS = 4  # alternating projections on disc and obstacle in each advance; they begin where the last ones ended
 _PLANES = 3  # of a body: a corner has three faces
 

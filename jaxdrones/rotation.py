@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.errors import UserError
-from jaxdrones.vector import atan2, components, dot, sin_cos
+from jaxdrones.vector import atan2, components, dot, is_double, polynomial, sin_cos
 
 _SMALL = 1e-6  # rad^2; below it the leading terms of power series are exact to 1e-18
 _POLE = 3 / 1024  # exact in every precision
@@ -85,13 +85,19 @@ def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotation by |v| rad about v; smooth at zero."""
+    """Rotation by |v| rad about v; smooth at zero. Every whole turn changes the sign of the quaternion."""
+    square = dot(_components(v, 3), v)
+    angle = jnp.sqrt(jnp.maximum(square, _SMALL))
+    turns = jnp.round(angle / (2 * math.pi))
+    return exp_half_turn(v * (1 - 2 * math.pi * turns / angle)) * (1 - 2 * (turns % 2))
+
+
+def exp_half_turn(v: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Rotation by |v| rad about v, at most half a turn, by power series without a root or branches, which are fast."""
     square = dot(_components(v, 3), v) / 4  # of half the angle
-    small = square < _SMALL
-    half = jnp.sqrt(jnp.maximum(square, _SMALL))
-    sin, cos = sin_cos(half)
-    sinc = jnp.where(small, 1 - square / 6 * (1 - square / 20), sin / half)
-    return jnp.append(v / 2 * sinc, jnp.where(small, 1 - square / 2 * (1 - square / 12), cos))
+    terms = 11 if is_double(v) else 7
+    cos, sinc = (polynomial([(-1) ** k / math.factorial(2 * k + odd) for k in range(terms)], square) for odd in (0, 1))
+    return jnp.append(v / 2 * sinc, cos)
 
 
 def log(q: Float[Array, "4"]) -> Float[Array, "3"]:

@@ -79,7 +79,7 @@ def sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n
     In single precision, where library functions prevent vectorization on a CPU, a minimax polynomial of the sine on
     [0, pi/2] is used, with a relative error of 5e-9. Whole turns are subtracted first.
     """
-    if _is_double(x):
+    if is_double(x):
         return jnp.sin(x), jnp.cos(x)
     turn = x - 2 * math.pi * jnp.round(x / (2 * math.pi))
     size = jnp.abs(turn)
@@ -108,7 +108,7 @@ def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     across branches, except for the turn between -pi and pi. It is therefore correct even if a compiled program computes
     x and y twice with different rounding.
     """
-    if _is_double(x) or _is_double(y):
+    if is_double(x) or is_double(y):
         return jnp.arctan2(y, x)
     across, along = jnp.abs(y), jnp.abs(x)
     large = jnp.maximum(across, along)
@@ -126,13 +126,19 @@ def _(point, change):
     return atan2(y, x), jnp.where(none, 0, (x * dy - y * dx) / jnp.where(none, 1, square))
 
 
-def _is_double(x: Array) -> bool:
-    return jnp.result_type(x) == jnp.float64
-
-
 def _odd(coefficients: Sequence[float], x: Array) -> Array:
     """Polynomial of x with these coefficients of odd powers, lowest first."""
-    square, value = x * x, jnp.zeros_like(x)
+    return x * polynomial(coefficients, x * x)
+
+
+def polynomial(coefficients: Sequence[float], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Polynomial of x with these coefficients, lowest first."""
+    value = jnp.zeros_like(x)
     for coefficient in reversed(coefficients):
-        value = value * square + coefficient
-    return x * value
+        value = value * x + coefficient
+    return value
+
+
+def is_double(x: Array) -> bool:
+    """Whether a number has double precision."""
+    return jnp.result_type(x) == jnp.float64

@@ -32,12 +32,12 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     """Semi-implicit Euler, order 1: velocities first, then poses with the new velocities.
 
     The attitude is rotated by the exponential map. The order of operations is that of gym-pybullet-drones. The explicit
-    gyroscopic term gains energy in a tumble (docs/physics.md), so use another integrator above a few rad/s. A step
-    begins with body rates of at most a quarter turn per step, which keeps the fastest tumble finite.
+    gyroscopic term gains energy in a tumble (docs/physics.md), so use another integrator above a few rad/s. The new
+    body rates are at most a quarter turn per step, which keeps the fastest tumble finite.
     """
     state = _normalized(state)  # the exponential map keeps the length only up to rounding
-    state = state.replace(omega=jnp.clip(state.omega, -_MAX_TURN / dt, _MAX_TURN / dt))
     after = _add(state, dt, derivative(state))
+    after = after.replace(omega=jnp.clip(after.omega, -_MAX_TURN / dt, _MAX_TURN / dt))
     pos, quat = state.pos + dt * after.vel, jax.vmap(_turn)(state.quat, dt * after.omega)
     return after.replace(pos=pos, quat=quat, aux=_moved(state.aux, after.aux, dt))
 
@@ -95,4 +95,4 @@ def _normalized(state: State) -> State:
 
 def _turn(quat: Float[Array, "4"], rotation_vector: Float[Array, "3"]) -> Float[Array, "4"]:
     """Attitude after a rotation about body axes, q exp(v)."""
-    return rotation.multiply(quat, rotation.exp(rotation_vector))
+    return rotation.multiply(quat, rotation.exp_half_turn(rotation_vector))

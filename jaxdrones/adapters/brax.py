@@ -1,11 +1,13 @@
 """Brax environments for its trainers, with `wrap_for_training` and, from jax 0.10 on, `trainers`.
 
+```python
 from jaxdrones.adapters import brax
 from brax.training.agents.ppo import train as ppo
 
 env = jd.make("hover")
 with brax.trainers():
     ppo.train(brax.wrap(env), episode_length=env.steps, wrap_env_fn=brax.wrap_for_training, ...)
+```
 """
 
 from __future__ import annotations

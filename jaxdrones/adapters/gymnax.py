@@ -1,11 +1,13 @@
 """Gymnax-style environments, for PureJaxRL and other compiled training loops.
 
+```python
 from jaxdrones.adapters import gymnax
 
 env = gymnax.wrap(jd.make("hover"))
 params = env.default_params
 obs, state = env.reset(key, params)
 obs, state, reward, done, info = env.step(key, state, action, params)
+```
 
 Gymnax itself is not needed.
 """

@@ -1,10 +1,12 @@
 """JaxMARL-style environments: dictionaries by agent, one agent per drone, for compiled training loops.
 
+```python
 from jaxdrones.adapters import jaxmarl
 
 env = jaxmarl.wrap(jd.make("leader-follower"))
 obs, state = env.reset(key)
 obs, state, rewards, dones, infos = env.step(key, state, {agent: action for agent in env.agents})
+```
 
 JaxMARL itself is not needed.
 """

@@ -216,6 +216,23 @@ def test_a_target_is_as_large_as_its_drone_would_be_there_and_is_seen_behind_obs
     assert "◇ target" in tab.run("document.getElementById('legend').textContent")
 
 
+def test_a_drone_behind_an_obstacle_shines_through_and_one_in_front_of_it_looks_as_always(view):
+    def blue(trunk):
+        """Share of the pixels at the drone, which is blue, that are blue."""
+        tab = view(page_of([[0.0, 0.0, 1.0]], scene=Scene.of(Cylinder(pos=trunk, radius=0.06, height=4.0))))
+        tab.run("jaxdrones.player.stage.setSharp(true); jaxdrones.player.draw(0); new Promise(requestAnimationFrame)")
+        with Image.open(io.BytesIO(tab.screenshot())) as image:
+            picture = np.asarray(image.convert("RGB"), float)
+        drawn = np.array(tab.run(f"{SEEN}(0)"))
+        (left, top), (right, bottom) = drawn.min(axis=0).astype(int), drawn.max(axis=0).astype(int)
+        red, _, blue = np.moveaxis(picture[top:bottom, left:right], -1, 0)
+        return np.mean(blue > red + 10)
+
+    free, behind, in_front = blue((9.0, 0.0, 2.0)), blue((-0.1, -0.11, 2.0)), blue((0.1, 0.11, 2.0))
+    assert behind > 0.3 * free
+    assert abs(in_front - free) < 0.1
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_texts_stand_out_from_the_page(view, scheme):
     tab = view(page_of([[0.0, 0.0, 1.0]]))

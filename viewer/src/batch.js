@@ -36,6 +36,14 @@ export class Batch extends Mesh {
     matrices.set(this.matrices);
     old.dispose();
     Object.assign(this, { geometry, matrices, capacity });
+    if (this.twin) this.twin.geometry = geometry;
+  }
+
+  /** A mesh of the same copies in another material. */
+  in(material) {
+    this.twin = new Mesh(this.geometry, material);
+    this.twin.frustumCulled = false;
+    return this.twin;
   }
 
   /** Place of a further copy. */
@@ -84,6 +92,7 @@ export class Batch extends Mesh {
   /** Draw the copies, as they are now. */
   update() {
     this.visible = this.count > 0;
+    if (this.twin) this.twin.visible = this.visible;
     this.geometry.setDrawRange(0, this.corners.length * this.count);
     for (const attribute of Object.values(this.geometry.attributes)) {
       attribute.clearUpdateRanges();

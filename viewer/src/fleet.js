@@ -1,8 +1,11 @@
 // All drones of all worlds: for every kind of vehicle a mesh for each level of detail, and the same for ghosts.
 
-import { Color, DoubleSide, Matrix4, MeshBasicMaterial, MeshLambertMaterial, Quaternion, ShaderMaterial, Vector3 } from "three";
+import {
+  Color, CustomBlending, DoubleSide, GreaterDepth, Matrix4, MeshBasicMaterial, MeshLambertMaterial, Quaternion, ShaderMaterial, Vector3,
+} from "three";
 import { Batch } from "./batch.js";
 import { armOf, scratch } from "./flight.js";
+import { BEFORE_DRONES } from "./solids.js";
 import { coarse, discs, dot, fine, plain, shadow } from "./vehicle.js";
 
 const SLOWED = 0.02; // rotors turn so much slower than they do, so that an eye can follow
@@ -16,6 +19,7 @@ const SMALLEST = 12, SMALLEST_ALONE = 40; // pixels, from rotor to rotor, of dro
 const BLURRED = 0.2; // of the speed of hovering: above it blades are a disc
 const OPAQUE = 1.6; // of the speed of hovering, at which a disc is as dense as it gets
 const GHOST_OPACITY = 0.28;
+const BEHIND = { opacity: 0.6, blending: CustomBlending, depthFunc: GreaterDepth, depthWrite: false }; // an obstacle: the drone shines through
 const SHADOW_DARKNESS = 0.5; // of a drone on the ground, of the light
 const NOWHERE = new Matrix4().makeScale(0, 0, 0), LEVEL = new Quaternion(), WHITE = new Color(1, 1, 1);
 
@@ -28,12 +32,15 @@ export class Fleet {
     this.angles = worlds.map((world) => new Float32Array(4 * world.n));
     this.slots = worlds.map((world) => new Array(world.n).fill(null));
     this.meshes = [];
+    this.behind = []; // drawn between obstacles and drones
     const add = (mesh) => (this.stage.scene.add(mesh), this.meshes.push(mesh), mesh);
     this.shapes = vehicles.map((vehicle) => [{}, { transparent: true, opacity: GHOST_OPACITY, depthWrite: false }].map((look) => {
       const levels = LEVELS.map(({ geometry, Material }) => add(new Batch(geometry(vehicle), new Material({ vertexColors: true, side: DoubleSide, ...look }))));
       const blur = new MeshBasicMaterial({ vertexColors: true, side: DoubleSide, transparent: true, opacity: look.opacity ?? 1, depthWrite: false });
+      if (!look.opacity) for (const level of levels) this.behind.push(level.in(new MeshBasicMaterial({ vertexColors: true, side: DoubleSide, ...BEHIND })));
       return { levels, discs: add(new Batch(discs(vehicle), blur)) };
     }));
+    for (const mesh of this.behind) (mesh.renderOrder = BEFORE_DRONES), stage.scene.add(mesh);
     this.shadows = add(new Batch(shadow(), softShadow()));
     this.smallest = Math.max(SMALLEST, SMALLEST_ALONE / Math.sqrt(Math.max(...worlds.map(({ n }) => n))));
     this.arms = vehicles.map(armOf);
@@ -77,6 +84,7 @@ export class Fleet {
       }
     });
     for (const mesh of this.meshes) mesh.update();
+    if (!stage.hasObstacles) for (const mesh of this.behind) mesh.visible = false;
   }
 
   /** Turn the rotors of a drone: their angles, those of blades slow enough to be seen, and the density of the others' discs. */

@@ -5,6 +5,8 @@ import {
 } from "three";
 import { materialOf } from "./materials.js";
 
+export const BEFORE_DRONES = -1; // obstacles are drawn first, then what of a drone is behind them
+
 const SHAPES = {
   Box: () => new BoxGeometry(1, 1, 1),
   Sphere: () => new SphereGeometry(1, 32, 20),
@@ -22,6 +24,7 @@ export function solids(scene) {
   const group = new Group();
   for (const solids of alike.values()) {
     const [{ kind, color }] = solids, mesh = new InstancedMesh(SHAPES[kind](solids[0]), materialOf(kind, color[3]), solids.length);
+    mesh.renderOrder = 2 * BEFORE_DRONES;
     solids.forEach((solid, i) => {
       mesh.setMatrixAt(i, new Matrix4().compose(new Vector3(...solid.pos), new Quaternion(...solid.quat), new Vector3(...scale(solid))));
       mesh.setColorAt(i, new Color().setRGB(...solid.color.slice(0, 3), SRGBColorSpace));

@@ -70,6 +70,7 @@ export class Stage {
     this.orbit.minDistance = radius / 100;
     this.cell = round(radius / 2);
     this.hasGround = this.ground.visible = ground;
+    this.hasObstacles = obstacles.length > 0;
     this.ground.lay(middle, radius, this.cell, SHADED * radius, obstacles.length > 0);
     if (ground && obstacles.length) this.shadows.draw(obstacles, middle, SHADED * radius);
     if (!stay || (!this.moved && this.mode === "orbit")) this.home();

@@ -1,9 +1,12 @@
-"""Atomic writing of files by renaming."""
+"""Atomic writing of files by renaming, and JSON."""
 
 import contextlib
+import json
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -63,3 +66,17 @@ def _synchronize(path: Path, mode: int) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def as_json(tree: Any, indent: int | None = None) -> str:
+    """JSON, by default in one line, with null for numbers that are not finite."""
+    return json.dumps(finite(tree), indent=indent, allow_nan=False)
+
+
+def finite(tree: Any) -> Any:
+    """The same dictionaries and lists with `None` for numbers that are not finite."""
+    if isinstance(tree, dict):
+        return {name: finite(x) for name, x in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [finite(x) for x in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree

@@ -1,7 +1,6 @@
 """Formatting of results: tables, JSON, success rates and evaluations."""
 
 import argparse
-import json
 import math
 import textwrap
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 
 from jaxdrones.envs.explanation import aligned
 from jaxdrones.training.presets import realism
+from jaxdrones.writing import as_json, finite
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
@@ -35,11 +35,6 @@ _COLUMNS = {  # result: (heading, format)
 }
 
 
-def as_json(results: dict[str, Any]) -> str:
-    """One line of JSON, with null for numbers that are not finite."""
-    return json.dumps(_finite(results), allow_nan=False)
-
-
 def print_results(options: argparse.Namespace, results: dict[str, Any], *lines: Any) -> None:
     """Print results: one line of JSON with --json, else lines of text that are not `None`."""
     print(as_json(results) if options.json else "\n".join(str(line) for line in lines if line is not None))
@@ -49,14 +44,6 @@ def listed(results: dict[str, Any]) -> str:
     """Names and numbers in one line."""
     shown = {name: f"{x:d}" if isinstance(x, int) else f"{x:g}" for name, x in results.items()}
     return ", ".join(f"{name.replace('_', ' ')} {x}" for name, x in shown.items())
-
-
-def _finite(x):
-    if isinstance(x, dict):
-        return {name: _finite(value) for name, value in x.items()}
-    if isinstance(x, list | tuple):
-        return [_finite(value) for value in x]
-    return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
 def summary(results: list[dict]) -> list[dict]:
@@ -76,7 +63,7 @@ def table(results: list[dict]) -> str:
     names = list(results[0])
     rows = [[_COLUMNS[name][0] for name in names]]
     rows += [
-        ["-" if _finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
+        ["-" if finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
         for row in results
     ]
     return textwrap.dedent(aligned(rows, str.rjust))

@@ -15,7 +15,7 @@ from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.live import add_live, live_server, show_training
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle, option, switch
-from jaxdrones.cli.report import as_json, described
+from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
@@ -30,6 +30,7 @@ from jaxdrones.training.presets import settings_known
 from jaxdrones.training.run import Run
 from jaxdrones.training.trainer import Trainer
 from jaxdrones.visualization import plots
+from jaxdrones.writing import as_json
 
 _SEEDS = arguments.whole(limit=1000)
 _HOSTS_HELP = (

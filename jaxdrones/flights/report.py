@@ -1,7 +1,6 @@
 """Report of a fit: `vehicle.urdf` and `report.json`."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from jaxdrones.flights.fit import Report
 from jaxdrones.flights.open_loop import HORIZONS, QUANTITIES
 from jaxdrones.flights.vehicle import REPORT, URDF
 from jaxdrones.urdf_writer import to_urdf
-from jaxdrones.writing import write
+from jaxdrones.writing import as_json, write
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
@@ -24,9 +23,8 @@ def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
         f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
     )
     write(folder / URDF, to_urdf(report.vehicle.params, "identified", comment).encode())
-    write(
-        folder / REPORT, (json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n").encode()
-    )
+    content = as_json(report_as_dict(report) | {"started_from": started_from}, indent=1)
+    write(folder / REPORT, (content + "\n").encode())
 
 
 def check_no_fit(folder: Path) -> None:

@@ -139,7 +139,7 @@ class Run:
 
     def save_report(self, report: dict[str, Any]) -> None:
         """Write report.json, which marks the run as finished."""
-        writing.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
+        writing.write(self.folder / "report.json", writing.as_json(report, indent=2).encode())
 
     def remove_report(self) -> None:
         """Mark the run as not finished."""

@@ -74,6 +74,14 @@ def test_a_fit_finds_the_vehicle_that_flew(flown, tmp_path):
     np.testing.assert_allclose(read.params.max_rpm, found.max_rpm, rtol=1e-6)
 
 
+def test_an_infinite_standard_error_is_null_in_the_report_which_is_strict_json(tmp_path):
+    vehicle = Vehicle.of(jaxdrones.load_params("cf2x"))
+    found = {"kf": Estimate(value=3e-10, std_error=np.inf, identifiable=False)}
+    write_vehicle(tmp_path / "fit", Report(vehicle, found, {}, (np.nan,), {}), "test")
+    report = json.loads((tmp_path / "fit" / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report["parameters"]["kf"]["std_error"] is None and report["losses"] == [None]
+
+
 @pytest.mark.slow
 def test_unidentifiable_parameters_are_named(flown):
     """With measured rotor speeds, no flight identifies how the rotors follow a command."""

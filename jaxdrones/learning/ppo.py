@@ -55,9 +55,9 @@ class Config(settings.Config):
     privileged_critic: arguments.Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
     target_kl: arguments.Positive = 0.02
-    """Kullback-Leibler divergence of the updated policy from the behavior policy, on the first minibatch. After an
-    update the learning rate falls if the divergence was above twice this value and rises if it was below half of it,
-    between `min_learning_rate` and `max_learning_rate`."""
+    """Kullback-Leibler divergence of the behavior policy from the updated one, a mean over the actions of the first
+    minibatch. If it is above twice this value after an update, the learning rate of the next update is lower by a
+    factor of 1.2, and higher if it is below half of it, between `min_learning_rate` and `max_learning_rate`."""
     min_learning_rate: arguments.Positive = 1e-5
     max_learning_rate: arguments.Positive = 1.5e-2
     anneal_fraction: arguments.Fraction = 0.3
@@ -143,14 +143,15 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     (params, log_std, critic), opt_state, metrics = learn(
         state.replace(worlds=None), worlds.hidden_state, trajectory, noise[:ends]
     )
-    learning_rate = result.adapted_learning_rate(config, state.step + 1, state.learning_rate, metrics["kl"])
-    max_std = result.annealed(config, state.step, config.init_std, config.final_std)
+    updates = state.step + 1
+    learning_rate = result.adapted_learning_rate(config, updates, state.learning_rate, metrics["kl"])
+    max_std = result.annealed(config, updates, config.init_std, config.final_std)
     log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, max_std)), jnp.log(max_std))
     obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
     policy = state.policy.replace(params=params).with_obs_stats(obs_stats)
     after, measured = measure(env, config, state.step, after, trajectory)
     metrics |= measured | {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
-    return TrainState(state.step + 1, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
+    return TrainState(updates, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
 
 
 train = result.make_train(Config, init, update)
@@ -159,8 +160,9 @@ train = result.make_train(Config, init, update)
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """Clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy.
 
-    The metrics are the error of the values and the Kullback-Leibler divergence from the behavior policy, by a
-    non-negative estimate. On several devices these are shares, see `sharding.share_of_mean`.
+    The metrics are the error of the values and the Kullback-Leibler divergence of the behavior policy from the policy,
+    by a non-negative estimate (k3 of Schulman 2020, "Approximating KL divergence"). On several devices these are
+    shares, see `sharding.share_of_mean`.
     """
     mean = policy.replay(jax.tree.map(lambda x: x[0], batch.hidden_state), batch.obs, batch.starts)
     log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob

@@ -122,7 +122,8 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
                 `learning.networks.OwnNetwork`.
             callback: function, or several, called after every update; see `Callback`.
             state: state to continue from, the `train_state` of a result with the same worlds, network and episodes; up
-                to `config.updates` updates in total. Vehicle, action type and rewards may differ.
+                to `config.updates` updates in total, or as many more if the state is traced, so that its number of
+                updates is unknown. Vehicle, action type and rewards may differ.
 
         Raises:
             ValueError: no random key, the settings of another learner, or a state that does not fit them or is without
@@ -139,19 +140,20 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             check_function("callback", one, ("update", "metrics", "state"))
         if state is not None:
             _check_state(state, functools.partial(init, env=env, config=config), network)
+        made = int(state.step) if state is not None and is_concrete(state.step) else 0
+        if made >= config.updates:
+            raise UserError(f"state has made {made} updates; give more updates, config.updates is {config.updates}")
         if is_inside_jit() or not all(map(is_concrete, (key, *vars(config).values()))):
             if callbacks:
                 raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
             state = init(key, env, config, network) if state is None else state
-            length: Any = config.updates - (int(state.step) if is_concrete(state.step) else 0)
+            length: Any = config.updates - made
             state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
             return Result(state.policy, state, history)
         start, program = _programs(init, update, env, config)
         if state is None:
             state = start(key) if network is None else init(key, env, config, network)
-        total, step = int(config.updates), int(state.step)
-        if step >= total:
-            raise UserError(f"state has made {step} updates; give more updates, config.updates is {total}")
+        total, step = int(config.updates), made
         rows, streak, stop = [], 0, False
         while step < total and not stop:
             count = 1 if callbacks else min(MAX_CALL, total - step)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from double_integrator import SMALL, Cue, DoubleIntegrator
 from flax import nnx
-from helpers import jit_unoptimized, mostly_slow, name_of
+from helpers import assert_close, jit_unoptimized, mostly_slow, name_of
 
 from jaxdrones.learning import bptt, checkpoint, evaluate, loggers, ppo, result
 from jaxdrones.learning.networks import MLP, OwnNetwork, Policy
@@ -175,6 +175,37 @@ def test_a_training_continued_from_a_state_is_one_long_training_and_the_callback
         learner.train(KEY, env, config, state=whole.train_state)
     with pytest.raises(ValueError, match="callback is not supported inside"):
         jax.eval_shape(lambda key: learner.train(key, env, config, callback=print), KEY)
+
+
+@EACH_LEARNER
+def test_a_training_continues_from_all_that_is_in_its_state(learner):
+    """Policy, statistics, optimizer, worlds and random key; an update that only counts leaves them as they are."""
+    env, config = DoubleIntegrator(), SMALL[learner]
+    first = jit_unoptimized(lambda: learner.init(KEY, env, config))()
+    arrays, structure = jax.tree.flatten(first.replace(step=None, key=None))
+    state = jax.tree.unflatten(structure, [x ^ True if x.dtype == bool else x + 1 for x in arrays])
+    state = state.replace(step=first.step + 1, key=jax.random.key(7))
+
+    def update(env, config, state):
+        return state.replace(step=state.step + 1), {"nonfinite_gradients": jnp.zeros((), int)}
+
+    train = result.make_train(type(config), learner.init, update)
+    for trained in train(KEY, env, config, state=state), train(KEY, env, config, state=state, callback=lambda *_: None):
+        assert len(trained.history["nonfinite_gradients"]) == config.updates - 1
+        assert trained.train_state.key == state.key and trained.train_state.step == config.updates
+        assert_close(trained.train_state.replace(step=None, key=None), state.replace(step=None, key=None), 0)
+
+
+def test_a_state_without_updates_left_is_refused_alone_and_in_a_program_of_the_user():
+    env, config = DoubleIntegrator(), SMALL[bptt]
+    state = jit_unoptimized(lambda: bptt.init(KEY, env, config))().replace(step=jnp.asarray(config.updates + 1))
+
+    def rate_trained(learning_rate):
+        return bptt.train(KEY, env, dataclasses.replace(config, learning_rate=learning_rate), state=state)
+
+    for train in rate_trained, jax.jit(rate_trained):
+        with pytest.raises(ValueError, match=r"state has made 4 updates; give more updates, config.updates is 3"):
+            train(1e-3)
 
 
 def test_csv_gets_every_update_and_a_missing_library_is_named(tmp_path, monkeypatch):

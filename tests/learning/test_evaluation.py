@@ -121,6 +121,10 @@ def test_successes_are_counted_in_episodes_or_in_drones_that_end_alone(ends, suc
     report = report_as_dict(flown(jnp.array([-1.0, 0.0]), env=env))
     assert (report["episodes"], report["successes"], report["trials"]) == (3, successes, trials)
     assert f", {successes} of {trials}{' drones' * (ends == 'drone')}, " in described_success(report)
+    steps = 5 if ends == "team" else (5 + 12) / 2  # to the end of the team, or mean of those to the ends of the drones
+    np.testing.assert_allclose([report["mean_length"], report["mean_return"]], [0.1 * steps, steps], rtol=1e-6)
+    np.testing.assert_allclose(report["final_error"], 0.5 / 2, atol=1e-6)
+    assert report["end_rates"] == {"fell": 1 if ends == "team" else 0.5, "done": 0}
 
 
 class YawTorque(PyTreeNode):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from double_integrator import DoubleIntegrator, Point, PointWorld
 from helpers import assert_close, jit_unoptimized
 
 import jaxdrones as jd
@@ -34,6 +35,44 @@ def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_pol
     np.testing.assert_allclose(action[1::2, 1:], act(scaled(policy, -3.0))[1::2, 1:], rtol=1e-6)
     halves = jnp.concatenate([against(obs[:2]), against(obs[2:])])  # as on two devices
     np.testing.assert_allclose(halves, action, rtol=1e-6)
+
+
+class Pair(DoubleIntegrator):
+    """The first drone is rewarded for the actions of both, and the second one for `share` of that of the first."""
+
+    drones = 2
+
+    def __init__(self, share):
+        self.share = share
+
+    def reset(self, key):
+        return jnp.zeros((2, 2)), PointWorld(Point(jnp.zeros((2, 2))), jnp.zeros((), jnp.int32))
+
+    begin = reset
+
+    def step(self, key, world, action):
+        obs, world, _, *rest = super().step(key, world, action)
+        first, second = action[:, 0]
+        return obs, world, jnp.stack([first + second, self.share * first]), *rest
+
+
+def test_an_update_flies_the_others_by_past_policies_and_learns_from_the_rewards_of_the_first_drones_alone():
+    """The policies have constant actions: that of the present one is 0."""
+
+    def constant(policy, action):
+        return policy.replace(
+            params=jax.tree.map(lambda x: jnp.full_like(x, 0 if x.ndim > 1 else jnp.arctanh(action)), policy.params)
+        )
+
+    def update(share):
+        state = league.init(KEY, Pair(share), CONFIG)
+        policy = constant(state.policy, 0.0)
+        past = jax.tree.map(lambda *x: jnp.stack(x), constant(policy, 0.2), constant(policy, -0.6))
+        return league.update(Pair(share), CONFIG, state.replace(policy=policy, past=past))[1]
+
+    metrics = jit_unoptimized(jax.vmap(update))(jnp.array([0.0, 5.0]))
+    np.testing.assert_allclose(metrics["reward"], (0.2 - 0.6) / 2 / 2, rtol=1e-6)  # mean of both drones
+    assert metrics["gradient_norm"][0] > 0 and metrics["gradient_norm"][0] == metrics["gradient_norm"][1]
 
 
 def test_a_training_from_a_policy_begins_against_that_policy():

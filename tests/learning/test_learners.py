@@ -142,6 +142,67 @@ def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_on
 
 
 @pytest.mark.float32
+def test_an_episode_that_fails_at_its_time_limit_is_terminated_and_not_truncated():
+    env = Clock(steps=1)
+
+    @jit_unoptimized
+    def flown(key):
+        starts = collect.draw_starts(key, env, 16)
+        worlds = collect.restart(key, collect.empty_worlds(env, 16), starts)
+        act = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
+        return worlds.episodes.world.drones.pos, collect.collect(key, env, act, worlds, 1)[1]
+
+    fails, trajectory = flown(jax.random.key(0))
+    np.testing.assert_array_equal(trajectory.terminated[0], fails[..., 0] > 0)
+    np.testing.assert_array_equal(trajectory.truncated, ~trajectory.terminated)
+    assert 0 < np.sum(trajectory.terminated) < 16
+
+
+@pytest.mark.float32
+def test_with_a_discount_of_zero_bptt_learns_from_the_first_reward_alone():
+    def gradient(horizon, gamma):
+        config = dataclasses.replace(SMALL[bptt], horizon=horizon, gamma=gamma)
+        env = DoubleIntegrator()
+        return horizon * bptt.update(env, config, bptt.init(jax.random.key(0), env, config))[1]["gradient_norm"]
+
+    first, discounted = jit_unoptimized(lambda: (gradient(1, 1.0), gradient(2, 0.0)))()
+    assert first > 0
+    np.testing.assert_allclose(discounted, first, rtol=1e-5)
+
+
+class Leaver(Clock):
+    """The first of two drones leaves after two steps, and observes a number that means nothing from then on."""
+
+    task = types.SimpleNamespace(**vars(Clock.task) | {"ends": "drone"})
+
+    def __init__(self, meaningless):
+        super().__init__(steps=4, drones=2)
+        self.meaningless = meaningless
+
+    def step(self, key, world, action):
+        obs, world, _, _, truncated, info = super().step(key, world.replace(drones=Point(0 * world.drones.pos)), action)
+        first = jnp.arange(2) == 0
+        active = ~first | (world.step <= 2)
+        info |= dict(active=active, terminated=first & (world.step == 2), truncated=truncated & active)
+        obs = jnp.where((active & ~info["terminated"])[:, None], obs, self.meaningless)
+        return obs, world, jnp.where(active, -(action[:, 0] ** 2), 0), jnp.zeros((), bool), truncated, info
+
+
+@pytest.mark.float32
+def test_ppo_learns_nothing_from_what_a_drone_observes_after_its_end():
+    config = dataclasses.replace(SMALL[ppo], horizon=5, epochs=1, minibatches=1)
+
+    def learnt(meaningless):
+        env = Leaver(meaningless)
+        after, metrics = ppo.update(env, config, ppo.init(jax.random.key(0), env, config))
+        return after.policy, after.critic, after.log_std, metrics
+
+    learnt = jit_unoptimized(jax.vmap(learnt))(jnp.array([0.0, 3.0]))
+    for x in jax.tree.leaves(learnt):
+        np.testing.assert_allclose(x[1], x[0], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.float32
 @pytest.mark.parametrize("learner", mostly_slow([bptt, shac], [bptt]), ids=["bptt", "shac"])
 def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learner):
     """An episode observes 0, 1, 2; where nothing is reset, five more steps of the trajectory observe 3."""
@@ -280,7 +341,7 @@ def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
 def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_it(epochs, minibatches):
     env = DoubleIntegrator()
     config = dataclasses.replace(SMALL[ppo], epochs=epochs, minibatches=minibatches, max_learning_rate=10.0)
-    rates, updates, std = jnp.array([1e-4, 3.0, 3.0]), jnp.array([3, 3, 1]), jnp.array([0.4, 0.4, 0.05])
+    rates, updates, std = jnp.array([1e-4, 3.0, 1e-4]), jnp.array([3, 3, 1]), jnp.array([0.4, 0.05, 0.4])
 
     def update(rate, updates, std):
         own = dataclasses.replace(config, learning_rate=rate, updates=updates, init_std=std)
@@ -290,7 +351,7 @@ def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_i
     assert 0 < metrics["kl"][0] < config.target_kl / 2 and metrics["kl"][1] > 2 * config.target_kl
     moved = [1.2e-4, 3 / 1.2, config.min_learning_rate]  # the last one after the last update
     np.testing.assert_allclose(metrics["learning_rate"], moved, rtol=1e-6)
-    stds = [0.05, config.final_std]  # below min_std it has no room, and after the last update neither
+    stds = [0.05, config.final_std]  # below min_std it has no room, and after the last update no more than this
     np.testing.assert_allclose(metrics["action_std"][1:], stds, rtol=1e-6)
 
 

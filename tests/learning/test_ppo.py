@@ -36,6 +36,19 @@ def test_the_loss_of_ppo_has_no_gradient_where_the_clipped_ratio_is_worse_and_fa
     assert slope_of(jnp.zeros(1), clipped, 0.1).item() == pytest.approx(-0.1)
 
 
+def test_the_divergence_of_ppo_is_that_of_the_updated_policy_seen_from_the_behavior_policy(monkeypatch):
+    """Of two normal distributions; the mean over the behavior policy is one over equally likely actions."""
+    monkeypatch.setattr(ppo, "discounted_value", lambda *_: jnp.zeros((4096, 1)))
+    policy, zero = SimpleNamespace(replay=lambda memory, obs, starts: obs), jnp.zeros((4096, 1))
+    action = jax.scipy.stats.norm.ppf((jnp.arange(4096.0) + 0.5) / 4096)[:, None, None]
+    mean, std = 0.5, 0.5
+    behavior = ppo.log_prob(action, jnp.zeros_like(action), jnp.zeros(1))
+    batch = ppo.Batch(jnp.full_like(action, mean), action, behavior, action, zero, zero)
+    loss = jit_unoptimized(lambda log_std: ppo.loss(ppo.Config(), policy, log_std, None, batch)[1]["kl"])
+    expected = np.log(std) + (1 + mean**2) / (2 * std**2) - 0.5
+    assert loss(jnp.log(jnp.array([std]))) == pytest.approx(expected, rel=1e-3)
+
+
 @pytest.mark.parametrize(("own", "expected"), [(0.0, 1e-3), (5e-3, 5e-3), (1.0, 2e-2)])
 def test_the_learning_rate_of_the_critic_is_its_own_up_to_20_times_that_of_the_policy(own, expected):
     rates = ppo._rates(ppo.Config(critic_learning_rate=own), jnp.asarray(1e-3))
@@ -98,6 +111,9 @@ def test_a_step_is_followed_by_the_next_one_or_by_what_was_seen_last(monkeypatch
     following = np.array([[2, 101], [0, 5], [6, 105], [106, 107]])  # 0 after a termination
     np.testing.assert_allclose(found.value_target[..., 0], 1 + 0.5 * following)
     np.testing.assert_array_equal(found.starts, [[0, 0], [0, 1], [1, 0], [0, 1]])
+    advantage = found.value_target - obs[..., 0]
+    normalized = (advantage - np.mean(advantage)) / np.std(advantage)  # over all steps of all worlds
+    np.testing.assert_allclose(found.advantage, normalized, rtol=1e-6)
 
 
 def test_no_noise_of_an_update_is_used_twice(monkeypatch):

@@ -9,7 +9,7 @@ from double_integrator import SMALL
 from helpers import jit_unoptimized
 
 import jaxdrones as jd
-from jaxdrones.learning import ppo
+from jaxdrones.learning import collect, ppo
 
 KEY = jax.random.key(0)
 HOVER = jd.make("hover").task
@@ -41,6 +41,13 @@ def test_the_start_of_a_task_sees_the_progress_of_training_without_another_compi
         height = state.worlds.episodes.world.drones.pos[:, 0, 2]
         np.testing.assert_allclose(height, 1 + number / 4, atol=0.02)
     assert len(traced) == 1
+
+
+def test_the_progress_of_training_is_the_share_of_the_updates_that_are_made():
+    env = jd.make(dataclasses.replace(HOVER, start=rising))
+    config = dataclasses.replace(SMALL[ppo], updates=4)
+    assert [collect.progress_of(env, config, np.int32(step)) for step in range(4)] == [0, 0.25, 0.5, 0.75]
+    assert collect.progress_of(jd.make(HOVER), config, np.int32(0)) is None
 
 
 @pytest.mark.parametrize("progress", [-0.1, 1.5, "half"])

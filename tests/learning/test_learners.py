@@ -7,15 +7,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from double_integrator import SMALL, Clock, DoubleIntegrator, Point, PointWorld, dynamics
-from helpers import jit_unoptimized, mostly_slow
+from helpers import assert_close, jit_unoptimized, mostly_slow, name_of
 
 from jaxdrones import envs
 from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.envs.randomize import scaled
 from jaxdrones.learning import bptt, collect, critic, ppo, shac
 from jaxdrones.learning.critic import critic_observation
+from jaxdrones.learning.exploration import sample
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import RunningStatistics
@@ -170,6 +172,103 @@ def test_with_a_discount_of_zero_bptt_learns_from_the_first_reward_alone():
     np.testing.assert_allclose(discounted, first, rtol=1e-5)
 
 
+class Watched(Clock):
+    """A team whose privileged observation is the time of its episode."""
+
+    def privileged_observation(self, world):
+        time = jnp.full((self.drones, 1), world.step, float)
+        return PrivilegedObservation(time, 0 * time)
+
+
+@pytest.mark.float32
+def test_memory_begins_anew_with_every_episode_and_what_is_recorded_is_of_the_observations_before_and_after_a_step():
+    """The memory counts observations; that of the first one of an episode is 1."""
+    env = Watched(steps=3)
+
+    @jit_unoptimized
+    def flown(key):
+        starts = collect.draw_starts(key, env, 4)
+        worlds = collect.empty_worlds(env, 4).replace(hidden_state=jnp.full((4, 1, 1), 7.0))
+        worlds = collect.restart(key, worlds, starts)
+        act = lambda noise, memory, obs: (memory + 1, 0 * obs, None)  # noqa: E731
+        return collect.collect(key, env, act, worlds, 7, starts=starts, privileged=True)[1]
+
+    trajectory = flown(jax.random.key(0))
+    np.testing.assert_array_equal(trajectory.hidden_state, trajectory.obs + 1)
+    np.testing.assert_array_equal(trajectory.privileged.obs, trajectory.obs)
+    np.testing.assert_array_equal(trajectory.final_obs, trajectory.obs + 1)
+    np.testing.assert_array_equal(trajectory.final_privileged.obs, trajectory.final_obs)
+    assert np.sum(trajectory.done) > 4
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("learner", mostly_slow(SMALL, [bptt, ppo]), ids=name_of)
+def test_a_fraction_of_the_worlds_starts_new_episodes_before_an_update_and_the_others_continue_theirs(learner):
+    env = DoubleIntegrator()
+
+    def lengths(restart_fraction):
+        config = dataclasses.replace(SMALL[learner], restart_fraction=restart_fraction)
+        state = learner.init(jax.random.key(0), env, config)
+        worlds = state.worlds.replace(
+            episodes=state.worlds.episodes.replace(length=jnp.full(4, 7, jnp.int32)), done=jnp.zeros(4, bool)
+        )
+        return learner.update(env, config, state.replace(worlds=worlds))[0].worlds.episodes.length
+
+    none, all_worlds = jit_unoptimized(jax.vmap(lengths))(jnp.array([0.0, 1.0]))
+    np.testing.assert_array_equal(none, 7 + SMALL[learner].horizon)
+    np.testing.assert_array_equal(all_worlds, SMALL[learner].horizon)
+
+
+@pytest.mark.parametrize("learner", [bptt, shac], ids=name_of)
+def test_the_learning_rate_falls_to_zero_by_a_cosine_over_all_gradient_steps(learner):
+    """With a constant gradient a step of Adam is as long as the learning rate."""
+    config = dataclasses.replace(SMALL[learner], updates=3, learning_rate=0.5)
+    optimizers = [(bptt.optimizer(config), 3, 0.5)]
+    if learner is shac:
+        optimizers += [(shac._critic_optimizer(config), 3 * config.critic_steps, config.critic_learning_rate)]
+    for optimizer, count, rate in optimizers:
+        params = jnp.zeros(1)
+        state, steps = optimizer.init(params), []
+        update = jit_unoptimized(optimizer.update)
+        for _ in range(count):
+            step, state = update(params + 0.1, state)
+            steps.append(-step.item())
+        np.testing.assert_allclose(steps, rate * (1 + np.cos(np.pi * np.arange(count) / count)) / 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("learner", SMALL, ids=name_of)
+def test_an_optimizer_takes_a_gradient_of_any_length_as_one_of_the_largest_norm(learner):
+    """After a shorter one, as the first step of Adam is the same for every length."""
+    config = dataclasses.replace(SMALL[learner], max_grad_norm=0.5)
+    optimizers = [ppo._optimizer(config)] if learner is ppo else [bptt.optimizer(config)]
+    optimizers += [shac._critic_optimizer(config)] if learner is shac else []
+    for optimizer in optimizers:
+        params = jnp.zeros(2)
+        update = jit_unoptimized(optimizer.update)
+        state = update(params + 0.01, optimizer.init(params))[1]
+        direction = jnp.array([0.6, -0.8])
+        at_limit, beyond, below = (update(length * direction, state)[0] for length in (0.5, 500.0, 0.05))
+        np.testing.assert_allclose(beyond, at_limit, rtol=1e-6)
+        assert optax_norm(below - at_limit) > 0.01 * optax_norm(at_limit)
+
+
+@pytest.mark.float32
+def test_the_target_critic_of_shac_moves_a_part_of_the_way_to_the_critic_after_its_gradient_steps():
+    env = DoubleIntegrator()
+    config = dataclasses.replace(SMALL[shac], target_update_rate=0.25, critic_steps=3, horizon=2)
+
+    @jit_unoptimized
+    def update(key):
+        before = shac.init(key, env, config)
+        return before, shac.update(env, config, before)[0]
+
+    before, after = update(jax.random.key(0))
+    assert_close(after.target_critic, jax.tree.map(lambda x, y: x + (y - x) / 4, before.critic, after.critic), 1e-6)
+    assert optax_norm(jax.tree.map(jnp.subtract, after.critic, before.critic)) > 3 * config.critic_learning_rate
+    counts = optax.tree.get_all_with_path(after.critic_opt_state, "count")
+    assert {int(count) for _, count in counts} == {3}
+
+
 class Leaver(Clock):
     """The first of two drones leaves after two steps, and observes a number that means nothing from then on."""
 
@@ -255,14 +354,17 @@ def three_worlds(monkeypatch):
 ACTS = types.SimpleNamespace(act=lambda hidden, obs: (hidden, obs))
 
 
-def test_the_cost_of_shac_is_that_of_the_discounted_rewards_and_of_the_value_after_them(three_worlds, monkeypatch):
-    """Half of the value counts, after half of the warmup."""
+@pytest.mark.parametrize(("step", "weight"), [(3, 0.5), (9, 1.0)])
+def test_the_cost_of_shac_is_that_of_the_discounted_rewards_and_of_the_value_after_them(
+    step, weight, three_worlds, monkeypatch
+):
+    """Half of the value counts after half of the warmup, and all of it after the whole."""
     costs = []
     monkeypatch.setattr(bptt, "policy_step", lambda *args, **_: costs.append(args[-1]))
-    state = types.SimpleNamespace(key=jax.random.key(0), step=3, target_critic=1.0)
+    state = types.SimpleNamespace(key=jax.random.key(0), step=step, target_critic=1.0)
     with pytest.raises(TypeError):  # as no step is made
         shac.update(None, shac.Config(gamma=0.5, horizon=3, updates=10, terminal_value_warmup=0.6), state)
-    worth = [1 + 1 / 2 + 1 / 4 + 24 / 8 / 2, 1 + 8 / 2 / 2, 1 + 1 / 2]
+    worth = [1 + 1 / 2 + 1 / 4 + weight * 24 / 8, 1 + weight * 8 / 2, 1 + 1 / 2]
     cost = jit_unoptimized(lambda trajectory: costs[0](ACTS, trajectory))
     np.testing.assert_allclose(cost(three_worlds), -np.mean(worth) / 3)
 
@@ -341,17 +443,22 @@ def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
 def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_it(epochs, minibatches):
     env = DoubleIntegrator()
     config = dataclasses.replace(SMALL[ppo], epochs=epochs, minibatches=minibatches, max_learning_rate=10.0)
-    rates, updates, std = jnp.array([1e-4, 3.0, 1e-4]), jnp.array([3, 3, 1]), jnp.array([0.4, 0.05, 0.4])
+    rates, updates = jnp.array([1e-4, 3.0, 1e-4, 1e-4]), jnp.array([3, 3, 1, 2])
+    std, anneal_fraction = jnp.array([0.4, 0.05, 0.4, 0.4]), jnp.array([0.3, 0.3, 0.3, 1.0])
 
-    def update(rate, updates, std):
-        own = dataclasses.replace(config, learning_rate=rate, updates=updates, init_std=std)
-        return ppo.update(env, own, ppo.init(jax.random.key(0), env, own))[1]
+    def update(rate, updates, std, anneal_fraction):
+        own = dict(learning_rate=rate, updates=updates, init_std=std, anneal_fraction=anneal_fraction)
+        own = dataclasses.replace(config, **own)
+        after, metrics = ppo.update(env, own, ppo.init(jax.random.key(0), env, own))
+        return metrics, after.policy.obs_stats.count, optax.tree.get(after.opt_state, "count")
 
-    metrics = jit_unoptimized(jax.vmap(update))(rates, updates, std)
+    metrics, observed, steps = jit_unoptimized(jax.vmap(update))(rates, updates, std, anneal_fraction)
+    np.testing.assert_array_equal(observed, config.worlds * config.horizon)
+    np.testing.assert_array_equal(steps, epochs * minibatches)
     assert 0 < metrics["kl"][0] < config.target_kl / 2 and metrics["kl"][1] > 2 * config.target_kl
     moved = [1.2e-4, 3 / 1.2, config.min_learning_rate]  # the last one after the last update
-    np.testing.assert_allclose(metrics["learning_rate"], moved, rtol=1e-6)
-    stds = [0.05, config.final_std]  # below min_std it has no room, and after the last update no more than this
+    np.testing.assert_allclose(metrics["learning_rate"][:3], moved, rtol=1e-6)
+    stds = [0.05, config.final_std, (0.4 * config.final_std) ** 0.5]  # below min_std; after the last update; halfway
     np.testing.assert_allclose(metrics["action_std"][1:], stds, rtol=1e-6)
 
 
@@ -424,6 +531,8 @@ def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
     std = np.exp(log_std)
     density = np.exp(-((action - mean) ** 2) / (2 * std**2)) / (std * np.sqrt(2 * np.pi))
     np.testing.assert_allclose(ppo.log_prob(action, mean, jnp.asarray(log_std)), np.log(density).sum(-1), rtol=1e-12)
+    noise = (action - mean) / std
+    np.testing.assert_allclose(sample(noise, mean, jnp.asarray(log_std)), action, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -451,8 +560,10 @@ def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
 
 def test_deviations_of_parameters_of_any_vehicle_are_within_the_reach_of_a_critic():
     """They are up to 1,000 times the nominal ones, at which every unit of the network is saturated."""
-    policy: Any = types.SimpleNamespace(obs_stats=RunningStatistics.empty(2))
+    statistics = RunningStatistics(jnp.array([1.0, 2.0]), jnp.array([4.0, 9.0]), jnp.ones(()))
+    policy: Any = types.SimpleNamespace(obs_stats=statistics)
     params = jnp.array([[0.5, -1.0, 1160.0, -1160.0, 0.0]])
-    found = critic_observation(policy, jnp.zeros((1, 2)), None, PrivilegedObservation(jnp.zeros((1, 2)), params))
+    found = critic_observation(policy, jnp.full((1, 2), 7.0), None, PrivilegedObservation(jnp.zeros((1, 2)), params))
+    np.testing.assert_allclose(found[0, :2], [-1 / 2, -2 / 3], rtol=1e-6)  # normalized like what a policy observes
     large = 1 + np.log(1160)
     np.testing.assert_allclose(found[0, 2:], [0.5, -1.0, large, -large, 0.0], rtol=1e-6)

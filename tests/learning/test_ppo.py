@@ -36,6 +36,16 @@ def test_the_loss_of_ppo_has_no_gradient_where_the_clipped_ratio_is_worse_and_fa
     assert slope_of(jnp.zeros(1), clipped, 0.1).item() == pytest.approx(-0.1)
 
 
+def test_the_error_of_the_values_counts_by_its_weight_in_units_of_a_reward(monkeypatch):
+    monkeypatch.setattr(ppo, "discounted_value", lambda config, critic, obs: obs)
+    policy, zero = SimpleNamespace(replay=lambda memory, obs, starts: obs), jnp.zeros((2, 1))
+    batch = ppo.Batch(zero[..., None], zero[..., None], zero, jnp.array([[3.0], [5.0]]), zero, zero + 1)
+    for value_coef in 0.0, 0.5, 2.0:
+        config = ppo.Config(gamma=0.75, value_coef=value_coef)
+        loss, metrics = ppo.loss(config, policy, jnp.zeros(1), None, batch)
+        assert metrics["value_loss"] == (0.5**2 + 1.0**2) / 2 and loss == value_coef * metrics["value_loss"]
+
+
 def test_the_divergence_of_ppo_is_that_of_the_updated_policy_seen_from_the_behavior_policy(monkeypatch):
     """Of two normal distributions; the mean over the behavior policy is one over equally likely actions."""
     monkeypatch.setattr(ppo, "discounted_value", lambda *_: jnp.zeros((4096, 1)))

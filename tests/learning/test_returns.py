@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.learning.collect import Worlds
-from jaxdrones.learning.metrics import mean_return, with_returns
+from jaxdrones.learning.metrics import mean_return, measure, with_returns
 from jaxdrones.learning.returns import advantages, discounted_rewards
 
 T, W = 12, 5
@@ -74,6 +74,24 @@ def test_rewards_after_the_end_of_an_episode_do_not_count():
     was_done[1:, 1] = True
     found = discounted_rewards(types.SimpleNamespace(reward=reward, was_done=was_done), 0.5)
     np.testing.assert_array_equal(found[..., 0], [[1, 2], [2, 0], [4, 0]])
+
+
+def test_the_metrics_of_an_update_are_means_over_the_steps_of_episodes():
+    was_done = np.array([[False, False], [False, True], [True, True]])[..., None]
+    numbers = np.where(was_done, 100.0, np.arange(6.0).reshape(3, 2, 1))
+    trajectory = types.SimpleNamespace(
+        reward=numbers,
+        error=2 * numbers,
+        terminated=was_done | (numbers == 2),
+        **dict(was_done=was_done, done=np.zeros((3, 2), bool), length=np.ones((3, 2)), episode_return=numbers),
+    )
+    worlds = Worlds(None, None, None, last_return=jnp.array([3.0, 5.0]), last_weight=jnp.array([3.0, 1.0]))
+    config, env = types.SimpleNamespace(restart_fraction=0.5, horizon=3), types.SimpleNamespace(steps=6)
+    found = [measure(env, config, jnp.asarray(step), worlds, trajectory)[1] for step in (0, 1)]
+    for metrics in found:
+        assert metrics["reward"] == 1 and metrics["error"] == 2  # of 0, 1, and 2
+        np.testing.assert_allclose(metrics["termination_rate"], 1 / 3)
+    np.testing.assert_array_equal([metrics["return"] for metrics in found], [np.nan, 3.5])  # whole episodes take 2
 
 
 def test_an_episode_weighs_as_many_as_were_restarted_before_their_ends():

@@ -127,6 +127,16 @@ def test_successes_are_counted_in_episodes_or_in_drones_that_end_alone(ends, suc
     assert report["end_rates"] == {"fell": 1 if ends == "team" else 0.5, "done": 0}
 
 
+def test_errors_of_a_report_are_those_of_all_drones():
+    """One of two drones stays at its target, and the other one climbs by as much in each of 12 steps."""
+    report = flown(jnp.array([0.0, 0.2]), env=lift(drones=2, terminations={}, success_terminations=()))
+    error = 2 * report.final_error
+    assert error > 0.01
+    np.testing.assert_allclose(list(report.final_error_percentiles.values()), [error / 2, error, error], rtol=1e-6)
+    later = error * np.arange(3, 13) / 12  # in the last four fifths
+    np.testing.assert_allclose(report.rms_error, np.sqrt(np.mean(later**2) / 2), rtol=1e-6)
+
+
 class YawTorque(PyTreeNode):
     """A yaw torque for some steps, then none."""
 

@@ -384,6 +384,28 @@ def test_the_critic_of_shac_learns_the_values_of_the_target_critic_in_steps_that
     np.testing.assert_allclose(loss, 0.5**2 * np.sum(np.square(targets)) / 9)
 
 
+def test_the_critic_of_shac_learns_from_every_step_of_a_trajectory(three_worlds):
+    """Also from the first and the last of five, of which each gradient step takes four."""
+    config = shac.Config(gamma=0.5, gae_lambda=0.0, horizon=5, critic_steps=16)
+    critic, optimizer = jnp.zeros(()), shac._critic_optimizer(config)
+    state = types.SimpleNamespace(
+        policy=ACTS, critic=critic, target_critic=critic, critic_opt_state=optimizer.init(critic)
+    )
+
+    def loss(rewarded):
+        """Of a trajectory in which only one step has a reward, and so a value other than that of the critic."""
+        reward = 1.0 * (jnp.arange(5) == rewarded)[:, None, None]
+        never, obs = jnp.zeros((5, 1, 1), bool), jnp.zeros((5, 1, 1, 1))
+        ends = dict(truncated=never, terminated=never, was_done=never)
+        trajectory = three_worlds.replace(reward=reward, obs=obs, final_obs=obs, **ends)
+        return shac._fit_critic(config, jax.random.key(0), state, trajectory)[2]["loss"]
+
+    losses = jit_unoptimized(jax.vmap(loss))(jnp.arange(5))
+    np.testing.assert_allclose(losses[1:4], 0.5**2 / 4)
+    np.testing.assert_allclose(losses[0] + losses[4], 0.5**2 / 4)
+    assert losses[0] > 0 and losses[4] > 0
+
+
 @pytest.mark.float32
 @pytest.mark.parametrize("ends", mostly_slow(["truncated", "terminated"], ["truncated"]))
 def test_an_episode_that_ends_inside_a_trajectory_of_shac_is_worth_the_same_as_one_that_ends_with_it(ends):

@@ -484,6 +484,25 @@ def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_i
     np.testing.assert_allclose(metrics["action_std"][1:], stds, rtol=1e-6)
 
 
+@pytest.mark.float32
+def test_policy_standard_deviation_and_critic_of_ppo_move_by_their_learning_rates():
+    """The first step of Adam is as long as the learning rate in every parameter with a gradient."""
+    env, rates = DoubleIntegrator(), jnp.array([1e-4, 1e-2])
+    config = dataclasses.replace(SMALL[ppo], epochs=1, minibatches=1, critic_learning_rate=1e-3)
+
+    def largest_steps(rate):
+        before = ppo.init(jax.random.key(0), env, dataclasses.replace(config, learning_rate=rate))
+        before = before.replace(log_std=before.log_std - 0.5)  # within its bounds
+        after, _ = ppo.update(env, config, before)
+        of = lambda state: (state.policy.params, state.log_std, state.critic)  # noqa: E731
+        steps = jax.tree.map(lambda x, y: jnp.max(jnp.abs(y - x)), of(before), of(after))
+        return [jnp.max(jnp.stack(jax.tree.leaves(step))) for step in steps]
+
+    policy, log_std, critic = jit_unoptimized(jax.vmap(largest_steps))(rates)
+    np.testing.assert_allclose([policy, log_std], [rates, rates], rtol=0.01)  # the parameters are rounded
+    np.testing.assert_allclose(critic, [1e-3, 1e-3], rtol=0.01)
+
+
 def optax_norm(tree):
     return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))
 

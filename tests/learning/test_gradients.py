@@ -1,11 +1,14 @@
 """Gradient options change the gradient as they say, and never what is simulated."""
 
+import dataclasses
+
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized
+from double_integrator import DoubleIntegrator
+from helpers import jit_unoptimized, mostly_slow
 
 import jaxdrones as jd
 from jaxdrones import envs
@@ -36,6 +39,56 @@ def test_a_surrogate_takes_as_long_as_the_physics():
         ValueError, match=r"the surrogate takes 0.004167 s, and one of the physics 0.01 s; give .*=0.01"
     ):
         with_gradient(jd.make("hover"), config)
+    with pytest.raises(ValueError, match="give for example surrogate="):  # also by an update
+        env = jd.make("hover")
+        config = bptt.Config(**vars(CONFIG) | dict(gradient="surrogate", surrogate=jd.make_step()))
+        jax.eval_shape(lambda key: bptt.update(env, config, bptt.init(key, env, config)), jax.random.key(0))
+
+
+@pytest.mark.parametrize("gradient", mostly_slow(["surrogate", "point_mass"], ["point_mass"]))
+def test_the_physics_of_an_environment_has_the_derivative_of_the_setting(gradient):
+    env = jd.make("hover", substeps=2)
+    derivative = {"surrogate": jd.make_step(dt=env.dt), "point_mass": point_mass(env.dt)}[gradient]
+    state, rpm = jd.State.at_rest(jnp.zeros((1, 3))), jnp.full((1, 4), 15000.0)
+
+    def height(step):
+        return lambda rpm: step(env.params, state, rpm).pos[0, 2]
+
+    mixed = with_gradient(env, bptt.Config(gradient=gradient)).physics
+    steps = [jax.value_and_grad(height(step)) for step in (mixed, derivative)]
+    (value, slope), (_, expected) = jit_unoptimized(lambda rpm: [step(rpm) for step in steps])(rpm)
+    np.testing.assert_allclose(slope, expected, rtol=1e-12)
+    np.testing.assert_allclose(value, jit_unoptimized(height(env.physics))(rpm), rtol=1e-12)
+
+
+def test_between_steps_gradients_decay_and_outliers_are_limited():
+    slopes = jnp.array([1.0, 1.0, 100.0])
+
+    def gradient(**options):
+        between = gradient_between_steps(bptt.Config(**options))
+        return jax.grad(lambda x: jnp.sum(slopes * between(x)))(jnp.ones(3))
+
+    decay, limit = dict(gradient="decay", gradient_decay=0.5), dict(outlier_gradient=2.0)
+    found = jit_unoptimized(lambda: [gradient(), gradient(**decay), gradient(**limit), gradient(**decay, **limit)])()
+    np.testing.assert_allclose(found, [[1, 1, 100], [0.5, 0.5, 50], [1, 1, 2], [0.5, 0.5, 1]], rtol=1e-12)
+
+
+class OfStates(DoubleIntegrator):
+    """Rewards of the states before the steps, which actions change only by earlier steps."""
+
+    def step(self, key, world, action):
+        obs, after, _, *rest = super().step(key, world, action)
+        return obs, after, -jnp.sum(world.drones.pos**2, axis=-1), *rest
+
+
+@pytest.mark.float32
+def test_a_gradient_that_decays_at_once_has_nothing_of_later_steps():
+    def gradient(decay):
+        config = dataclasses.replace(CONFIG, horizon=3, gradient="decay", gradient_decay=decay)
+        return bptt.update(OfStates(), config, bptt.init(jax.random.key(0), OfStates(), config))[1]["gradient_norm"]
+
+    none, exact = jit_unoptimized(jax.vmap(gradient))(jnp.array([0.0, 1.0]))
+    assert none == 0 and exact > 0
 
 
 @pytest.mark.slow

@@ -206,17 +206,23 @@ def test_memory_begins_anew_with_every_episode_and_what_is_recorded_is_of_the_ob
 def test_a_fraction_of_the_worlds_starts_new_episodes_before_an_update_and_the_others_continue_theirs(learner):
     env = DoubleIntegrator()
 
-    def lengths(restart_fraction):
+    def updated(restart_fraction):
         config = dataclasses.replace(SMALL[learner], restart_fraction=restart_fraction)
         state = learner.init(jax.random.key(0), env, config)
         worlds = state.worlds.replace(
             episodes=state.worlds.episodes.replace(length=jnp.full(4, 7, jnp.int32)), done=jnp.zeros(4, bool)
         )
-        return learner.update(env, config, state.replace(worlds=worlds))[0].worlds.episodes.length
+        after, _ = learner.update(env, config, state.replace(worlds=worlds))
+        counts = [count for _, count in optax.tree.get_all_with_path(after.opt_state, "count")]
+        keys = jax.random.key_data(state.key), jax.random.key_data(after.key)
+        return after.worlds.episodes.length, (keys, after.step, counts)
 
-    none, all_worlds = jit_unoptimized(jax.vmap(lengths))(jnp.array([0.0, 1.0]))
+    (none, all_worlds), (keys, step, counts) = jit_unoptimized(jax.vmap(updated))(jnp.array([0.0, 1.0]))
     np.testing.assert_array_equal(none, 7 + SMALL[learner].horizon)
     np.testing.assert_array_equal(all_worlds, SMALL[learner].horizon)
+    assert not np.array_equal(*keys) and np.all(step == 1)  # the next update draws, and counts, anew
+    gradient_steps = SMALL[ppo].epochs * SMALL[ppo].minibatches if learner is ppo else 1
+    np.testing.assert_array_equal(counts, np.full_like(counts, gradient_steps))
 
 
 @pytest.mark.parametrize("learner", [bptt, shac], ids=name_of)
@@ -472,14 +478,16 @@ def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_i
         own = dict(learning_rate=rate, updates=updates, init_std=std, anneal_fraction=anneal_fraction)
         own = dataclasses.replace(config, **own)
         after, metrics = ppo.update(env, own, ppo.init(jax.random.key(0), env, own))
-        return metrics, after.policy.obs_stats.count, optax.tree.get(after.opt_state, "count")
+        counts = after.policy.obs_stats.count, optax.tree.get(after.opt_state, "count")
+        return metrics, after.learning_rate, *counts
 
-    metrics, observed, steps = jit_unoptimized(jax.vmap(update))(rates, updates, std, anneal_fraction)
+    metrics, rate, observed, steps = jit_unoptimized(jax.vmap(update))(rates, updates, std, anneal_fraction)
     np.testing.assert_array_equal(observed, config.worlds * config.horizon)
     np.testing.assert_array_equal(steps, epochs * minibatches)
     assert 0 < metrics["kl"][0] < config.target_kl / 2 and metrics["kl"][1] > 2 * config.target_kl
     moved = [1.2e-4, 3 / 1.2, config.min_learning_rate]  # the last one after the last update
-    np.testing.assert_allclose(metrics["learning_rate"][:3], moved, rtol=1e-6)
+    np.testing.assert_allclose(rate[:3], moved, rtol=1e-6)
+    np.testing.assert_array_equal(metrics["learning_rate"], rate)
     stds = [0.05, config.final_std, (0.4 * config.final_std) ** 0.5]  # below min_std; after the last update; halfway
     np.testing.assert_allclose(metrics["action_std"][1:], stds, rtol=1e-6)
 

@@ -172,6 +172,51 @@ def test_with_a_discount_of_zero_bptt_learns_from_the_first_reward_alone():
     np.testing.assert_allclose(discounted, first, rtol=1e-5)
 
 
+class Dice(Clock):
+    """Rewards that are drawn in every step."""
+
+    def step(self, key, world, action):
+        obs, world, reward, *rest = super().step(key, world, action)
+        return obs, world, jax.random.uniform(key, reward.shape), *rest
+
+
+@pytest.mark.float32
+def test_every_step_of_every_world_draws_anew_and_what_has_ended_waits_for_its_restart():
+    env = Dice(steps=3)
+    still = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
+
+    @jit_unoptimized
+    def flown(key):
+        starts = collect.draw_starts(key, env, 8)
+        worlds = collect.restart(key, collect.empty_worlds(env, 8), starts)
+        after, trajectory = collect.collect(key, env, still, worlds, 5)
+        return after, trajectory, collect.restart(key, after, starts)
+
+    after, trajectory, again = flown(jax.random.key(0))
+    valid = ~np.asarray(trajectory.was_done)
+    assert len(np.unique(trajectory.reward[valid])) == valid.sum() > 8
+    lengths = valid.sum(axis=0)[:, 0]
+    assert set(lengths.tolist()) == {1, 3} and np.all(after.done)
+    np.testing.assert_array_equal(after.obs[:, 0, 0], lengths)
+    np.testing.assert_array_equal(trajectory.obs[-1, :, 0, 0], lengths)
+    assert not np.any(again.done) and not np.any(again.obs) and not np.any(again.episodes.length)
+
+
+def test_as_many_worlds_are_restarted_as_the_fraction_says_and_all_that_have_ended():
+    env = Clock()
+
+    @jit_unoptimized
+    def restarted(key):
+        starts = collect.draw_starts(key, env, 1000)
+        worlds = collect.empty_worlds(env, 1000)
+        flying = worlds.replace(done=jnp.arange(1000) < 100, obs=worlds.obs + 1)
+        return collect.restart(key, flying, starts, 0.3).obs[:, 0, 0] == 0
+
+    found = np.asarray(restarted(jax.random.key(0)))
+    assert np.all(found[:100])
+    assert np.mean(found[100:]) == pytest.approx(0.3, abs=4 * np.sqrt(0.3 * 0.7 / 900))
+
+
 class Watched(Clock):
     """A team whose privileged observation is the time of its episode."""
 

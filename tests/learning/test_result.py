@@ -10,7 +10,14 @@ from double_integrator import SMALL, DoubleIntegrator
 
 from jaxdrones import envs, learning
 from jaxdrones.learning import Diverged, Policy, bptt, evaluate, ppo, shac
-from jaxdrones.learning.result import PATIENCE, adapted_learning_rate, check_gradients, clip_gradient, count_nonfinite
+from jaxdrones.learning.result import (
+    PATIENCE,
+    adapted_learning_rate,
+    check_gradients,
+    clip_gradient,
+    count_nonfinite,
+    make_train,
+)
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
@@ -78,6 +85,20 @@ def test_training_goes_on_after_gradients_that_are_not_finite_unless_they_repeat
             check_gradients(counts, before=before)
     with pytest.raises(Diverged, match="not finite in 2 updates in a row"):
         check_gradients([1, 1], patience=2)
+
+
+def test_gradients_that_are_not_finite_are_counted_over_all_calls_of_the_program():
+    """A callback makes one call of every update; the schedules know the number of all updates."""
+    totals = []
+    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[bptt], updates=2 * PATIENCE)
+
+    def update(env, config, state):
+        return state.replace(step=state.step + 1), {"nonfinite_gradients": jnp.ones((), int), "updates": config.updates}
+
+    train = make_train(bptt.Config, bptt.init, update)
+    with pytest.raises(Diverged, match=f"not finite in {PATIENCE} updates in a row"):
+        train(KEY, env, config, callback=lambda update, metrics, state: totals.append(metrics["updates"]))
+    assert totals == [2 * PATIENCE] * (PATIENCE - 1)
 
 
 @pytest.mark.parametrize(("before", "made", "advice"), [(0, 3, "try a smaller"), (1, 1, "learning rate is not the")])

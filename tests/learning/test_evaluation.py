@@ -173,8 +173,8 @@ def test_a_failure_counts_where_the_goal_is_reached_in_the_same_step_and_any_oth
 
 
 def test_an_episode_with_a_position_that_is_not_finite_is_no_success():
-    env = lift(success=lambda metrics, dt: jnp.ones(1, bool))
-    assert flown(0.1, env=env).success == 1 and flown(jnp.nan, env=env).success == 0
+    env = lift(drones=2, success=lambda metrics, dt: jnp.ones(2, bool))  # nor one with such a position of one drone
+    assert [flown(jnp.array([0.1, x]), env=env).success for x in (0.1, jnp.nan)] == [1, 0]
 
 
 @pytest.mark.slow
@@ -201,6 +201,13 @@ def test_the_interval_is_that_of_the_distinct_episodes(changes, distinct):
     n = distinct(50)
     assert report.episodes == 50 and report.distinct_episodes == n and report.success == 1
     assert report.success_interval == (None if n == 1 else wilson_interval(n, n))
+
+
+def test_every_step_of_an_episode_has_noise_of_its_own():
+    """The drone falls by 3 cm in the steps before which it sees itself on one side: about half of 12."""
+    env = lift(noise=lambda key, state: state.replace(pos=state.pos + jax.random.normal(key, (1, 3))))
+    report = evaluate(env, lambda obs: jnp.where(obs[:, :1] > 0, 0.0, -0.3) * jnp.ones((1, 4)), KEY, 5)
+    assert 0.03 * 2 < report.final_error_percentiles[50] < 0.03 * 10 and report.distinct_episodes == 5
 
 
 def test_a_task_without_a_criterion_has_no_success():

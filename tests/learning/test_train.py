@@ -276,6 +276,10 @@ def test_the_best_policy_is_kept(monkeypatch):
     for update in reports:
         best(update, {}, types.SimpleNamespace(policy=update))
     assert best.policy == 3 and best.report.success == 0.9
+    best = loggers.KeepBest(None, KEY, every=2)
+    for update in reports:
+        best(update, {}, types.SimpleNamespace(policy=update))
+    assert best.policy == 2  # the third one was not evaluated
 
 
 def test_a_policy_whose_return_is_no_number_is_replaced_by_any_other(monkeypatch):

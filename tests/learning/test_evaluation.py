@@ -210,6 +210,31 @@ def test_every_step_of_an_episode_has_noise_of_its_own():
     assert 0.03 * 2 < report.final_error_percentiles[50] < 0.03 * 10 and report.distinct_episodes == 5
 
 
+def test_the_start_and_the_steps_of_an_episode_draw_from_keys_of_their_own():
+    """A key that is split and folded makes the same keys twice."""
+    seen, task = [], LIFT.task
+
+    def note(key):
+        jax.debug.callback(lambda data: seen.append(tuple(data.tolist())), jax.random.key_data(key))
+
+    def noise(key, state):
+        note(key)
+        return state
+
+    def start(key, params):
+        for own in jax.random.split(key):
+            note(own)
+        return task.start(key, params)
+
+    env = lift(noise=noise, start=start)
+    jax.eval_shape(env.reset, KEY)
+    jax.effects_barrier()
+    seen.clear()  # keys of the starts with which the environment was checked
+    evaluate(env, lambda obs: 0 * obs[:, :1] * jnp.ones((1, 4)), KEY, 2)
+    jax.effects_barrier()
+    assert len(seen) == len(set(seen)) == 2 * (2 + 1 + 12)  # starts, first observations, and steps
+
+
 def test_a_task_without_a_criterion_has_no_success():
     report = flown(0, env=lift(success=None))
     assert report.success is None and report.success_interval is None

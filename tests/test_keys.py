@@ -92,6 +92,13 @@ def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
     keys.check(least=2 * 8 + 3)
 
 
+def test_no_key_of_a_start_is_made_twice(keys):
+    """`fold_in(key, 1)` is the second of the keys that `split(key)` makes."""
+    env = make("swap-goals", drones=3, random_places=True)
+    jax.jit(env.task.start)(KEY, env.params)
+    keys.check(least=8)
+
+
 def test_the_streams_of_an_environment_have_numbers_of_their_own():
     streams = {name: number for name, number in vars(environment).items() if name.isupper() and type(number) is int}
     assert {"DISTURBANCE", "NOISE", "START", "RANDOMIZE", "RESET", "SENSORS", "SCENE", "VISION"} <= set(streams)

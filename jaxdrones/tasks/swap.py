@@ -43,13 +43,12 @@ def swap_goals(drones: Team = 8, duration: Seconds | None = None, random_places:
         """Nearly at rest, on a ring or at random places."""
         apart = 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH
         check_apart(params, apart, "a smaller vehicle or fewer drones")
-        start_key, order_key = jax.random.split(key)
+        start_key, order_key, box_key, which_key = jax.random.split(key, 4)
         angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
         state = thrown(start_key, params, ring, reach=_REACH, speed=0.1, omega=0.1, tilt=0.1)
         goal = jnp.roll(ring, jax.random.randint(order_key, (), 1, drones), axis=0)
         if random_places:
-            box_key, which_key = jax.random.split(jax.random.fold_in(key, 1))
             boxed = in_box(box_key, params, Scene(), middle, side, random_box=True)
             which = jax.random.bernoulli(which_key, _BOXED)
             state, goal = jax.tree.map(lambda x, y: jnp.where(which, x, y), boxed, (state, goal))

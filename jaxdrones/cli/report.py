@@ -63,8 +63,7 @@ def table(results: list[dict]) -> str:
     names = list(results[0])
     rows = [[_COLUMNS[name][0] for name in names]]
     rows += [
-        ["-" if finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
-        for row in results
+        ["-" if finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names] for row in results
     ]
     return textwrap.dedent(aligned(rows, str.rjust))
 

@@ -19,7 +19,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
 from jaxdrones.tasks.pairs import nearest_on_the_way
-from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.starts import check_apart, thrown
 from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm
 from jaxdrones.vector import unit
 
@@ -27,6 +27,7 @@ HEIGHT = 4.0  # m of the center of the leader's curve
 _MAX_DISTANCE = 10.0  # m
 _MIN_PERIOD = 2.0  # s
 _MAX_SPEED = 30.0  # m/s, bound of an observation
+_REACH = 0.1  # m, or a tenth of a shorter distance, of starts about their places along each axis
 _SETTLED = 2.0  # s: time after which the leader has to be in view
 _IN_VIEW = 0.95  # share of the time
 _TOLERANCE = 0.3  # share of the distance
@@ -75,6 +76,8 @@ def follow(
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """The leader on its curve, the others in a line behind it, facing it."""
+        reach = min(_REACH, distance / 10)
+        check_apart(params, distance - 2 * math.sqrt(2) * reach, "a smaller vehicle or a larger distance")
         curve_key, phase_key, bearing_key, start_key = jax.random.split(key, 4)
         dtype = params.mass.dtype
         variables = {
@@ -85,7 +88,7 @@ def follow(
         bearing = jax.random.uniform(bearing_key, (), dtype, -math.pi, math.pi)
         behind = jnp.stack([-jnp.cos(bearing), -jnp.sin(bearing), 0 * bearing])
         pos = first.pos[None] + distance * jnp.arange(drones, dtype=dtype)[:, None] * behind[None]
-        state = thrown(start_key, params, pos, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        state = thrown(start_key, params, pos, reach=reach, speed=0.1, omega=0.1, tilt=0.1)
         facing = jnp.stack([0 * bearing, 0 * bearing, jnp.sin(bearing / 2), jnp.cos(bearing / 2)])
         quat = jax.vmap(rotation.multiply, (None, 0))(facing, state.quat)
         state = state.replace(quat=quat, vel=state.vel + first.vel[None])

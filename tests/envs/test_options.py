@@ -1,6 +1,7 @@
 """Options of `make` and of tasks: nonsense is refused with what was given and what to give."""
 
 import inspect
+import math
 
 import jax
 import jax.numpy as jnp
@@ -77,12 +78,20 @@ def test_sizes_at_which_rewards_are_not_finite_or_compiling_does_not_end_are_ref
         TASKS[task](**{option: 10 * most})
 
 
-@pytest.mark.parametrize("task", ["race", "gates", "swap-goals", "forest"])
+@pytest.mark.parametrize("task", ["race", "gates", "swap-goals", "forest", "follow"])
 def test_drones_that_would_start_in_each_other_are_refused(task):
-    drones = {} if task in ("race", "swap-goals") else {"drones": 2}
-    assert make(task, **drones)
+    options = {"race": {}, "swap-goals": {}, "follow": {"distance": 0.3}}.get(task, {"drones": 2})
+    assert make(task, **options)
     with pytest.raises(ValueError, match=r"drones of this vehicle are 0\.76 m wide and would start in each other"):
-        make(task, vehicle="x500", **drones)
+        make(task, vehicle="x500", **options)
+
+
+def test_followers_start_apart_however_short_their_distance():
+    env = make("follow", drones=3, distance=0.3)
+    _, worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 200))
+    pos = worlds.drones.pos
+    apart = jnp.linalg.norm(pos[:, 1:] - pos[:, :-1], axis=-1)
+    assert 0.3 - 2 * math.sqrt(2) * 0.03 < apart.min() < apart.max() < 0.4
 
 
 def test_a_scene_in_which_every_start_is_inside_an_obstacle_is_refused():

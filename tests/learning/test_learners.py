@@ -318,6 +318,7 @@ def test_the_target_critic_of_shac_moves_a_part_of_the_way_to_the_critic_after_i
     assert optax_norm(jax.tree.map(jnp.subtract, after.critic, before.critic)) > 3 * config.critic_learning_rate
     counts = optax.tree.get_all_with_path(after.critic_opt_state, "count")
     assert {int(count) for _, count in counts} == {3}
+    assert before.key != after.key and after.step == 1  # the next update draws, and counts, anew
 
 
 class Leaver(Clock):

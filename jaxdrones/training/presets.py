@@ -129,6 +129,7 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # Rotors that lag filter the noise of actions; a policy trained with more noise oscillates less.
     ("hover", "ppo"): dict(
         updates=1500,
+        restart_fraction=0.2,
         hidden_sizes=(64, 64),
         critic_hidden_sizes=(64, 64),
         privileged_critic=True,
@@ -193,7 +194,7 @@ _REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
         omega=2.0,
         tilt=110.0,
         randomize=realistic_randomization(
-            mass=(0.87, 1.1), inertia=(0.8, 1.25), kf=(0.9, 1.13), rotor_fall_time=(0.1, 1.35)
+            mass=(0.87, 1.13), inertia=(0.8, 1.25), kf=(0.87, 1.13), rotor_fall_time=(0.1, 1.35)
         ),
     ),
 }

@@ -48,8 +48,8 @@ def hover(
         tilt: largest initial tilt, degrees.
         height: height of the goal, m; at most 1,000.
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
-        precision: weight of an additional reward exp(-distance / 10 cm) for training, at most 100. It is steep near the
-            goal, so that PPO, whose actions are noisy, learns to stay within centimeters.
+        precision: weight of an additional reward exp(-distance / 10 cm - speed / 0.2 m/s) for training, at most 100. It
+            is steep near the goal, so that PPO, whose actions are noisy, learns to stay there and not to oscillate.
         heading: weight of a penalty 1 - cos(heading), at most 100; without it a drone may turn away from its start.
     """
 

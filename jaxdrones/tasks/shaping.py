@@ -13,7 +13,8 @@ from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
-_PRECISE = 0.1  # m, over which the reward near the target falls by a factor of e
+_PRECISE, _CALM = 0.1, 0.2  # m, m/s: the reward near the target falls by a factor of e over each
+_STILL = 0.02  # m/s; below, its exponent is a parabola
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
 _STEEP = 0.1  # length of the nose's level part below which there is no heading
@@ -49,8 +50,11 @@ def position(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def near(task: Task, world: World) -> Float[Array, " n"]:
-    """exp(-distance / 10 cm) of the target; its slope is largest at the target."""
-    return jnp.exp(-length(world.drones.pos - task.target_now(world).pos, _NEAR) / _PRECISE)
+    """exp(-distance / 10 cm - speed / 0.2 m/s) relative to the target; steep near the target and at rest."""
+    target = task.target_now(world)
+    distance = length(world.drones.pos - target.pos, _NEAR)
+    speed = length(world.drones.vel - target.vel, _STILL)
+    return jnp.exp(-distance / _PRECISE - speed / _CALM)
 
 
 def velocity(task: Task, world: World) -> Float[Array, " n"]:

@@ -12,21 +12,26 @@ from jaxdrones.tasks.starts import thrown
 EAST = jnp.array([[1.0, 0.0, 0.0]])
 
 
-def test_the_reward_for_precision_falls_by_a_factor_of_e_in_ten_centimeters_and_is_steepest_near_the_goal():
+def test_the_reward_for_precision_falls_with_distance_and_speed_and_is_steepest_at_rest_at_the_goal():
+    """By a factor of e over 10 cm, and over 0.2 m/s."""
     env = jd.make("hover", precision=2.0)
     _, world = jit_unoptimized(env.reset)(jax.random.key(0))
     scale, near = env.task.rewards["near"]
     goal = world.variables["goal"][0]
 
     @jax.jit
-    def reward(distance):
-        return scale * near(env.task, world.replace(drones=world.drones.replace(pos=goal[None] + distance * EAST)))[0]
+    def reward(distance, speed):
+        drones = world.drones.replace(pos=goal[None] + distance * EAST, vel=speed * EAST)
+        return scale * near(env.task, world.replace(drones=drones))[0]
 
-    assert float(reward(0.0)) == 2.0
-    far, farther = float(reward(0.5)), float(reward(0.6))
-    np.testing.assert_allclose(farther / far, np.exp(-1), rtol=1e-3)  # beyond the parabola within 2 cm
-    slopes = jax.jit(jax.vmap(jax.grad(reward)))(jnp.array([0.03, 0.1, 0.3, 1.0]))
-    assert np.all(slopes < 0) and np.all(np.diff(np.asarray(slopes)) > 0)
+    assert float(reward(0.0, 0.0)) == 2.0
+    far = float(reward(0.5, 1.0))  # beyond the parabolas within 2 cm and 2 cm/s
+    np.testing.assert_allclose(float(reward(0.6, 1.0)) / far, np.exp(-1), rtol=1e-3)
+    np.testing.assert_allclose(float(reward(0.5, 1.2)) / far, np.exp(-1), rtol=1e-3)
+    x = jnp.array([0.03, 0.1, 0.3, 1.0])
+    for argument, points in ((0, (x, 0 * x)), (1, (0 * x, 2 * x))):
+        slopes = jax.jit(jax.vmap(jax.grad(reward, argument)))(*points)
+        assert np.all(slopes < 0) and np.all(np.diff(np.asarray(slopes)) > 0)
 
 
 def test_the_penalty_of_the_heading_is_one_minus_its_cosine_and_absent_by_default():

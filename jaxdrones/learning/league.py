@@ -92,7 +92,7 @@ def against(past: Policy, policy: Policy) -> collect.Act:
         others = of_past(past, jax.tree.map(of_others, obs))
         return hidden_state, jnp.concatenate([own, others.reshape(worlds, *others.shape[2:])], axis=1), None
 
-    return jax.tree_util.Partial(act, policy, jax.lax.stop_gradient(past))
+    return jax.tree_util.Partial(act, policy, past)
 
 
 train = result.make_train(Config, init, update)

@@ -123,7 +123,7 @@ def _fit_critic(config: Config, key: jax.Array, state: TrainState, trajectory: c
     now = discounted_value(config, state.target_critic, obs)
     later = discounted_value(config, state.target_critic, _final_observation(state.policy, trajectory))
     target = now + advantages(trajectory, now, later, config.gamma, config.gae_lambda)
-    data = jax.lax.stop_gradient((obs, target, (~trajectory.was_done).astype(target.dtype)))
+    data = obs, target, (~trajectory.was_done).astype(target.dtype)
     length = min(_CRITIC_BATCH, config.horizon)
 
     def loss(params, obs, target, mask):

@@ -185,9 +185,8 @@ _REALISTIC_PRACTICE_OPTIONS: dict[tuple[str, bool | str], dict[str, Any]] = {
     ),
 }
 _REALISTIC_PPO_OPTIONS: dict[str, dict[str, Any]] = {
-    # Without the additional reward drones settle a few centimeters away, or too late; with the starts of flight alone
-    # those from a large tilt do.
-    # With the wider parameters of the other learners fewer episodes succeed.
+    # Without the additional reward drones settle a few centimeters away, oscillate, or are late; with the starts of
+    # flight alone those from a large tilt are; with its parameters alone heavy drones with weak rotors settle too low.
     "hover": dict(
         precision=1.0,
         speed=1.5,

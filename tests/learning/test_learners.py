@@ -120,6 +120,11 @@ def test_a_world_whose_episode_ends_goes_on_from_the_start_of_another_world_a_di
     np.testing.assert_array_equal(obs, [jnp.roll(starts, -t, axis=0) for t in range(3)])
 
 
+def rest(noise, memory, obs):
+    """Action of zero."""
+    return memory, 0 * obs, None
+
+
 @pytest.mark.float32
 @pytest.mark.parametrize("reset", mostly_slow([True, False], [True]))
 def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_one_could_end(reset):
@@ -131,8 +136,7 @@ def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_on
         start_key, restart_key, key = jax.random.split(jax.random.fold_in(jax.random.key(0), step), 3)
         starts = collect.draw_starts(start_key, env, 1000)
         worlds = collect.restart(restart_key, worlds, starts, fraction)
-        act = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
-        worlds, flown = collect.collect(key, env, act, worlds, horizon, starts=starts if reset else None)
+        worlds, flown = collect.collect(key, env, rest, worlds, horizon, starts=starts if reset else None)
         worlds, metrics = measure(env, config, step, worlds, flown)
         return worlds, metrics["return"]
 
@@ -151,8 +155,7 @@ def test_an_episode_that_fails_at_its_time_limit_is_terminated_and_not_truncated
     def flown(key):
         starts = collect.draw_starts(key, env, 16)
         worlds = collect.restart(key, collect.empty_worlds(env, 16), starts)
-        act = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
-        return worlds.episodes.world.drones.pos, collect.collect(key, env, act, worlds, 1)[1]
+        return worlds.episodes.world.drones.pos, collect.collect(key, env, rest, worlds, 1)[1]
 
     fails, trajectory = flown(jax.random.key(0))
     np.testing.assert_array_equal(trajectory.terminated[0], fails[..., 0] > 0)
@@ -183,13 +186,12 @@ class Dice(Clock):
 @pytest.mark.float32
 def test_every_step_of_every_world_draws_anew_and_what_has_ended_waits_for_its_restart():
     env = Dice(steps=3)
-    still = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
 
     @jit_unoptimized
     def flown(key):
         starts = collect.draw_starts(key, env, 8)
         worlds = collect.restart(key, collect.empty_worlds(env, 8), starts)
-        after, trajectory = collect.collect(key, env, still, worlds, 5)
+        after, trajectory = collect.collect(key, env, rest, worlds, 5)
         return after, trajectory, collect.restart(key, after, starts)
 
     after, trajectory, again = flown(jax.random.key(0))
@@ -230,13 +232,15 @@ def test_memory_begins_anew_with_every_episode_and_what_is_recorded_is_of_the_ob
     """The memory counts observations; that of the first one of an episode is 1."""
     env = Watched(steps=3)
 
+    def count(noise, memory, obs):
+        return memory + 1, 0 * obs, None
+
     @jit_unoptimized
     def flown(key):
         starts = collect.draw_starts(key, env, 4)
         worlds = collect.empty_worlds(env, 4).replace(hidden_state=jnp.full((4, 1, 1), 7.0))
         worlds = collect.restart(key, worlds, starts)
-        act = lambda noise, memory, obs: (memory + 1, 0 * obs, None)  # noqa: E731
-        return collect.collect(key, env, act, worlds, 7, starts=starts, privileged=True)[1]
+        return collect.collect(key, env, count, worlds, 7, starts=starts, privileged=True)[1]
 
     trajectory = flown(jax.random.key(0))
     np.testing.assert_array_equal(trajectory.hidden_state, trajectory.obs + 1)

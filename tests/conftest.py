@@ -1,5 +1,6 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
+import functools
 import gc
 import importlib.metadata
 import importlib.util
@@ -23,8 +24,7 @@ import jax
 import jaxtyping
 import pytest
 import shapes
-from jax._src import pjit
-from jax._src.interpreters import pxla
+from jax._src.interpreters import mlir
 
 PACKAGE = Path(importlib.util.find_spec("jaxdrones").submodule_search_locations[0])
 MODULES = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
@@ -34,6 +34,10 @@ jaxtyping.install_import_hook(sorted(MODULES), "shapes.checked")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.devices()  # one, whichever test comes first: `jaxdrones train` makes each core one if JAX does not run
+
+# All programs are lowered in one context: to make one is a third of lowering, and each slows down those after it.
+if hasattr(mlir, "make_ir_context"):  # not promised by JAX
+    mlir.make_ir_context = functools.cache(mlir.make_ir_context)
 
 gc.freeze()
 gc.set_threshold(50_000)  # tracing makes many objects and little garbage: a twentieth of the time
@@ -66,10 +70,6 @@ def precision(request):
         yield
 
 
-@pytest.fixture(autouse=True, scope="module")
-def lowered():
-    """Forget lowered programs, not compiled ones: beside a thousand of them, lowering takes three times as long."""
-    yield
-    for module, name in ((pjit, "_pjit_lower"), (pxla, "_cached_lowering_to_hlo")):
-        if hasattr(module, name):  # not promised by JAX
-            getattr(module, name).cache_clear()
+def pytest_sessionfinish():
+    """Leave what the tests made to the end of the process, not to pytest's collections of garbage: three seconds."""
+    gc.freeze()

@@ -183,7 +183,7 @@ def _fly(
         memory = _slow_loops(gains, memory, state, setpoint, dt)
         attitude, thrust = jnp.append(memory.tilt, jnp.rad2deg(setpoint.yaw)), memory.thrust
     elif isinstance(setpoint, Attitude | Rates):
-        memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
+        memory = memory.replace(age=jnp.minimum(memory.age + dt, jnp.maximum(_SLOW, dt)))  # the slow loops become due
         attitude, thrust = loops.rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
         raise UserError(

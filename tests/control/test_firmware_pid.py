@@ -114,6 +114,16 @@ def test_the_slow_loops_run_at_every_fifth_call():
     np.testing.assert_array_equal(steps, [4, 9, 14])
 
 
+@pytest.mark.parametrize("dt", [DT, 0.03])
+def test_a_position_is_followed_at_once_after_an_attitude_was_for_10_ms(dt):
+    call = partial(firmware_pid.pwm, firmware_pid.gains(), dt=dt)
+    memory = firmware_pid.init().replace(age=jnp.array(0.004))
+    for _ in range(3):
+        memory, _ = call(memory, LEVEL, firmware_pid.Attitude(jnp.zeros(3), jnp.array(36000.0)))
+    _, command = call(memory, LEVEL, setpoint((0.5, 0, 1)))
+    np.testing.assert_allclose(command.attitude[:2], [0, -20], atol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def teams():
     """Where drones of all vehicles are after each control step of 8 s of flight by scaled gains, lagging rotors."""

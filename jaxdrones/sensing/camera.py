@@ -147,9 +147,10 @@ class DepthNoise:
         if self.spread or self.constant_spread:
             deviation = safe_sqrt((self.spread * depth**2) ** 2 + self.constant_spread**2)
             noisy += deviation * jax.random.normal(scatter_key, depth.shape, depth.dtype)
-        noisy = jnp.clip(noisy, 0 if camera.near is None else camera.near, far)
+        near = 0 if camera.near is None else camera.near
+        noisy = jnp.clip(noisy, near, far)
         if self.disparity_step:
-            noisy += jax.lax.stop_gradient(self._rounded(noisy, far) - noisy)
+            noisy += jax.lax.stop_gradient(jnp.maximum(self._rounded(noisy, far), near) - noisy)
         noisy = jnp.where(seen, noisy, far)
         if self.dropout:
             lost = jax.random.bernoulli(dropout_key, self.dropout, depth.shape)

@@ -53,6 +53,7 @@ def test_what_shows_nothing_stays_far_and_nothing_leaves_the_limits():
     read = noise.apply(KEY, flat(15.0), CAMERA)
     assert jnp.all((read >= 0.1) & (read <= 20.0))
     np.testing.assert_array_equal(DepthNoise().apply(KEY, flat(3.0), CAMERA), flat(3.0))
+    np.testing.assert_array_equal(DepthNoise(disparity_step=6.0).apply(KEY, flat(0.105), CAMERA), flat(0.1))
 
 
 @pytest.mark.slow

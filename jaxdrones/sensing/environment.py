@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, shape
+from jaxdrones.arguments import checked, number, shape
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -16,6 +16,7 @@ from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 
 _FIELD = shape(3, meaning="x, y, z, uT, world", name="{argument} of a {function}", finite=True)
+_RATE = Annotated[float, number("1/s", "{argument} of a {function}", above=0)]
 _PASCAL = 1 / 12.013  # m; height at sea level over which the pressure of the ISA falls by 1 Pa: 1 / (1.225 x 9.80665)
 
 BMP388 = Noise(density=0.03 * _PASCAL, turn_on=8 * _PASCAL)
@@ -29,7 +30,8 @@ EUROPE = (0.0, 21.5, -43.0)
 """uT; about the magnetic field at a latitude of 47 degrees in central Europe, with x east, y north and z up (WMM)."""
 
 
-def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer") -> Sensor:
+@checked
+def barometer(errors: Noise = BMP388, rate: _RATE = 50.0, name: str = "barometer") -> Sensor:
     """Barometer; its reading (1,) is the height above the origin by air pressure, m.
 
     The errors are in m; 1 Pa is 0.083 m at sea level. Wind and rotors disturb a real barometer by more.
@@ -42,7 +44,7 @@ def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer
 def magnetometer(
     errors: Noise = LIS3MDL,
     field: Annotated[tuple[float, float, float], _FIELD] = EUROPE,
-    rate: float = 20.0,
+    rate: _RATE = 20.0,
     name: str = "magnetometer",
 ) -> Sensor:
     """Magnetometer; its reading (3,) is the magnetic field in body axes, uT.

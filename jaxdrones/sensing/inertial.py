@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, shape
+from jaxdrones.arguments import checked, number, shape
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -56,7 +56,7 @@ sqrt(Hz) and offsets of +-60 mg and +-5 degrees/s, used as standard deviations. 
 @checked
 def imu(
     part: ImuPart = BMI088,
-    rate: float = 100.0,
+    rate: Annotated[float, number("1/s", "{argument} of an {function}", above=0)] = 100.0,
     offset: Annotated[tuple[float, float, float], _OFFSET] = (0.0, 0.0, 0.0),
     name: str = "imu",
 ) -> Sensor:

@@ -281,7 +281,8 @@ def test_an_estimate_has_a_gradient_through_the_flight(flown):
         (lambda: state_estimate(start=(-1, 0, 0)), "start of state_estimate is -1; give a number of at least 0"),
         (lambda: state_estimate(start=(0.1, np.nan, 0)), "start of state_estimate is nan"),
         (lambda: state_estimate(start=(1, 2)), r"start of state_estimate has shape \(2,\)"),
-        (lambda: barometer(rate=0), "rate of sensor 'barometer' is 0"),
+        (lambda: barometer(rate=0), "rate of a barometer is 0"),
+        (lambda: imu(rate=None), "rate of an imu is None; give a positive number"),
         (
             lambda: jd.make("hover", sensors=(imu(rate=500.0),)),
             "sensor 'imu' measures at 500 Hz, which does not divide",

@@ -116,7 +116,7 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
         return sensors
     for sensor in sensors:
         steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate else 1.0
-        if round(steps) < 1 or abs(steps - round(steps)) > _ROUNDING * steps:
+        if abs(steps - round(steps)) > _ROUNDING * steps:
             raise UserError(
                 f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz, which does not divide the {1 / dt:g} Hz of "
                 "the control steps; give it a rate that does, or another control_hz"

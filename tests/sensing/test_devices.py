@@ -12,6 +12,7 @@ from jaxdrones.dynamics.rigid_body import quat_rate
 from jaxdrones.sensing import (
     EUROPE,
     PERFECT,
+    ImuPart,
     MotionCaptureSystem,
     Noise,
     barometer,
@@ -86,9 +87,44 @@ def test_a_pose_of_a_steady_motion_is_as_old_as_the_delay(delay):
     sensor, params = motion_capture(MotionCaptureSystem(delay=delay)), jd.load_params("cf2x")
     rate = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3))))
     memory, vel, measure = sensor.init(KEY, params), np.array([1.0, -2.0, 0.5]), jit_unoptimized(sensor.measure)
-    for k in range(7):
-        memory, read = measure(KEY, params, rate.replace(pos=0.01 * k * vel), rate, jd.Scene(), memory)
+    for k in range(7):  # of quaternions whose sign changes at every measurement
+        state = rate.replace(pos=0.01 * k * vel, quat=(-1) ** k * jd.rotation.exp(0.01 * k * vel))
+        memory, read = measure(KEY, params, state, rate, jd.Scene(), memory)
     np.testing.assert_allclose(read["pos"], (0.06 - delay) * vel, rtol=1e-12)
+    np.testing.assert_allclose(read["quat"] @ read["quat"], 1, rtol=1e-12)
+    np.testing.assert_allclose(jd.rotation.log(read["quat"]), (0.06 - delay) * vel, rtol=1e-6)
+
+
+def test_the_first_pose_arrives_also_where_all_are_lost():
+    sensor, params, (state, rate) = (
+        motion_capture(MotionCaptureSystem(dropout=1.0)),
+        jd.load_params("cf2x"),
+        random_state(5),
+    )
+    memory, read = sensor.measure(KEY, params, state, rate, jd.Scene(), sensor.init(KEY, params))
+    assert read["fresh"] and np.allclose(read["quat"], state.quat, rtol=1e-12)
+    moved = state.replace(pos=state.pos + 1)
+    _, again = sensor.measure(KEY, params, moved, rate, jd.Scene(), memory)
+    assert not again["fresh"] and np.array_equal(again["pos"], read["pos"])
+
+
+@pytest.mark.parametrize(
+    "device",
+    [lambda e, rate: imu(ImuPart(e, e), rate), barometer, lambda e, rate: magnetometer(e, rate=rate)],
+    ids=["imu", "barometer", "magnetometer"],
+)
+def test_the_bias_of_a_device_walks_with_the_root_of_its_period(device):
+    params, (state, rate) = jd.load_params("cf2x"), random_state(6)
+    slow, fast = (device(Noise(random_walk=1.0), rate) for rate in (25.0, 100.0))
+    walked = [s.measure(KEY, params, state, rate, jd.Scene(), s.init(KEY, params))[0] for s in (slow, fast)]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, 2 * b, rtol=1e-12), *walked)
+
+
+def test_no_reading_of_an_imu_exceeds_its_bound():
+    sensor, params, (state, rate) = imu(), jd.load_params("cf2x"), random_state(7)
+    state, rate = (s.replace(vel=1e4 * s.vel, omega=1e4 * s.omega) for s in (state, rate))
+    _, read = sensor.measure(KEY, params, state, rate, jd.Scene(), sensor.init(KEY, params))
+    assert max(np.abs(x).max() for x in read.values()) == sensor.bound
 
 
 def test_the_field_that_a_magnetometer_feels_is_that_of_the_world_in_body_axes():

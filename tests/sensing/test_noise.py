@@ -10,6 +10,7 @@ import pytest
 
 from jaxdrones.sensing import (
     BMI088,
+    BMP388,
     MPU9250,
     DepthNoise,
     MotionCaptureSystem,
@@ -61,10 +62,17 @@ def test_each_parameter_is_read_off_its_own_part_of_the_curve():
 
 
 def test_the_noise_that_drives_a_bias_in_a_filter_is_that_of_its_steps():
-    noise, dt = Noise(instability=0.3, correlation=50.0, random_walk=0.02), 0.1
+    noise, dt = Noise(instability=0.3, correlation=50.0, random_walk=0.02, turn_on=0.3), 0.1
     errors = noise.init(KEY, (20_000,), float)
+    np.testing.assert_allclose(np.std(errors.bias), noise.bias, rtol=0.03)
     steps = noise.measure(jax.random.key(1), errors, jnp.zeros(20_000), dt)[0].bias - errors.bias
     np.testing.assert_allclose(np.std(steps), noise.bias_walk * np.sqrt(dt), rtol=0.03)
+
+
+def test_data_sheets_in_degrees_g_and_pascal_are_converted():
+    np.testing.assert_allclose([BMI088.gyro.turn_on, MPU9250.gyro.turn_on], np.radians([1, 5]))
+    np.testing.assert_allclose([BMI088.acc.turn_on, MPU9250.acc.turn_on], [20e-3 * 9.80665, 60e-3 * 9.80665])
+    np.testing.assert_allclose([BMP388.density, BMP388.turn_on], np.array([0.03, 8]) / (1.225 * 9.80665), rtol=1e-4)
 
 
 @pytest.mark.parametrize("part", [BMI088, MPU9250], ids=["BMI088", "MPU9250"])

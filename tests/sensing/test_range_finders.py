@@ -91,6 +91,7 @@ def test_a_device_is_turned_and_placed_on_the_body():
     quarter = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))  # the device's x axis is the body's y axis
     leftwards = range_finder("left", np.array([1.0, 0, 0]), max_range=9.0, orientation=quarter)
     np.testing.assert_allclose(reading(leftwards, at()), 1.5)
+    np.testing.assert_allclose(reading(leftwards, at(rpy=(0.3, 0, 0))), 1.5 / np.cos(0.3))
 
 
 @pytest.mark.parametrize(
@@ -140,6 +141,20 @@ def test_optical_flow_is_the_velocity_over_the_height_and_the_turn():
     near = at((0, 0, 0.02), vel=(0.4, 0, 0))  # out of focus: as from 8 cm
     np.testing.assert_allclose(reading(flow, near, Scene()), [0.4 / 0.08, 0])
     np.testing.assert_allclose(reading(flow, at(vel=(1, 1, 1)), Scene(ground=False)), 0)
+
+
+def test_noise_stays_within_the_range_and_each_beam_drops_out_alone():
+    beams = np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], 50, axis=0)  # to the wall and away from it
+    poor = range_finder("poor", beams, max_range=30.0, noise=3.0, dropout=0.5)
+    wall, none = np.split(reading(poor, at(), WALL), 2)
+    lost = wall == 30
+    assert wall.min() == 0 and lost.any() and not lost.all() and np.all(none == 30)
+
+
+def test_a_ray_passes_inactive_obstacles_and_is_nan_where_it_is_none():
+    ghost = Scene.of(Box(pos=(2.5, 0, 1), size=(1, 20, 20), active=False), ground=False)
+    assert jd.sensing.ray(ghost, HERE, jnp.array([1.0, 0, 0])) == jnp.inf
+    assert jnp.isnan(jd.sensing.ray(ghost, HERE, jnp.array([jnp.nan, 0, 0])))
 
 
 @pytest.mark.slow

@@ -39,6 +39,10 @@ def altimeter() -> jd.Sensor:
     return jd.Sensor("altimeter", measure)
 
 
+def at_100_hz() -> jd.Sensor:
+    return dataclasses.replace(altimeter(), rate=100.0)
+
+
 def odometer() -> jd.Sensor:
     """The distance covered at the drone's top speed, m, and the number of measurements: a memory that is a pytree."""
 
@@ -68,6 +72,10 @@ def test_every_drone_and_sensor_has_its_own_constants_memory_and_noise():
     assert count.tolist() == [2, 2]
     noise = np.stack([readings[name] - STATE.pos[:, 2] for name in ("altimeter", "second")])
     assert noise.shape == (2, 2) and np.diff(np.sort(noise, axis=None)).min() > 1e-6  # m, beyond rounding
+    drawn = [
+        dataclasses.replace(odometer(), name=name, init=lambda key, params: jax.random.normal(key)) for name in "ab"
+    ]
+    assert len(np.unique(list(init_sensors(drawn, KEY, PARAMS, STATE).values()))) == 4
 
 
 def test_equal_keys_give_equal_readings_and_a_further_sensor_changes_none():
@@ -137,11 +145,13 @@ def test_a_reading_without_a_memory_is_refused_although_it_is_traced():
         (lambda: check_sensors((altimeter(), altimeter())), "two sensors have the name 'altimeter'"),
         (lambda: check_sensors(altimeter()), "sensors is the single sensor 'altimeter'"),
         (lambda: check_sensors((3,)), r"sensors holds 3; give jaxdrones\.Sensor"),
+        (lambda: check_sensors((at_100_hz(),), 0.011), "'altimeter' measures at 100 Hz; give at most the control rate"),
     ],
 )
 def test_a_wrong_sensor_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+    assert check_sensors((at_100_hz(),), 0.01)  # of the control rate itself
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from jaxdrones.sensing import (
     VICON,
     ImuPart,
     MotionCaptureSystem,
+    Noise,
     Scene,
     barometer,
     imu,
@@ -164,6 +165,46 @@ def test_prediction_has_the_jacobian_of_its_own_motion_in_every_block():
         for column in PARTS:
             block, share = exact[row, column], half_turn if column == kalman.GYRO_BIAS else 1e-9
             np.testing.assert_allclose(found[row, column], block, rtol=0, atol=share * np.abs(block).max() + 1e-15)
+
+
+def test_an_imu_adds_its_densities_times_the_step_to_the_covariance_of_what_they_drive():
+    noise = kalman.ImuNoise(*map(jnp.array, (0.1, 0.2, 0.3, 0.4)))
+    zero = jnp.zeros(3)
+    cov = kalman.predict(noise, tilted(0.0), zero, zero, jnp.array(9.8), 0.01).cov
+    np.testing.assert_allclose(cov, np.diag(np.repeat([0, 0.2, 0.1, 0.3, 0.4], 3) ** 2 * 0.01), atol=1e-15)
+    noise = Noise(random_walk=0.3, instability=0.2, correlation=1.0)
+    assert imu_noise(ImuPart(acc=noise, gyro=Noise())).acc_walk == noise.bias_walk > 0.3
+
+
+@pytest.mark.slow
+def test_the_estimate_is_that_of_now_and_its_covariance_that_of_the_poses_which_arrived():
+    """An IMU almost without noise and poses of every second period, two periods old; half of them are lost."""
+    imu = Noise(density=1e-8, limit=35.0)
+    system = MotionCaptureSystem(rate=50.0, delay=0.02, dropout=0.5, pos_noise=1e-12)
+    sensor = state_estimate(ImuPart(imu, imu), system, attitude=False, start=(0.0, 0.0, 0.0))
+    params, (acc, omega) = jd.load_params("cf2x"), jnp.array([[1.0, -2, 0.5], [0.5, 1, -0.3]])
+
+    def at(t):
+        quat = jd.rotation.multiply(jd.rotation.exp(jnp.array([0, 0, 2.0])), jd.rotation.exp(omega * t))
+        return jd.State(acc * t**2 / 2, quat, acc * t, omega, jnp.zeros(4))
+
+    def measure(memory, now):
+        key, t = now
+        memory, read = sensor.measure(key, params, at(t), at(t), Scene(), memory)
+        oldest = memory.samples.fresh[0], memory.estimate.cov[0, 0]
+        return memory, (difference_to(read, at(t)), *oldest)
+
+    def difference_to(read, true):
+        return jnp.stack(
+            [read.pos - true.pos, read.vel - true.vel, kalman.angle(read.quat, true.quat), read.omega - omega]
+        )
+
+    run = jit_unoptimized(lambda keys, t: jax.lax.scan(measure, sensor.init(KEY, params), (keys, t))[1])
+    error, fresh, cov = map(np.asarray, run(jax.random.split(KEY, 20), 0.01 * jnp.arange(20)))
+    np.testing.assert_allclose(error, 0, atol=1e-5)
+    fresh, cov = fresh[4:], cov[4:]  # those of instant 2, and so on
+    assert not fresh[1::2].any() and 0 < fresh[::2].sum() < 8
+    assert np.all(cov[fresh] < 1e-23) and np.all(cov[~fresh] > 1e-23)
 
 
 def test_a_measurement_leaves_the_covariance_of_bayes_about_the_corrected_attitude():

@@ -81,7 +81,7 @@ def control(
     force = gains.pos_p * pos_error + gains.pos_i * pos_integral + gains.pos_d * pos_rate
     force = force + vector.along_z(params.weight)
 
-    rpy_error = _wrap_yaw(_angles_of(force) - rotation.to_rpy(state.quat))
+    rpy_error = _angles_of(force) - rotation.to_rpy(state.quat)
     rpy_integral = memory.rpy_integral + rpy_error * dt
     rpy_rate = (rpy_error - memory.rpy_error) / dt
     torque = gains.rpy_p * rpy_error + gains.rpy_i * rpy_integral + gains.rpy_d * rpy_rate
@@ -96,9 +96,3 @@ def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
     roll = atan2(-y, safe_sqrt(x**2 + z**2))
     pitch = atan2(x, z)
     return jnp.clip(jnp.stack([roll, pitch, jnp.zeros_like(roll)]), -_MAX_TILT, _MAX_TILT)
-
-
-def _wrap_yaw(rpy: Float[Array, "3"]) -> Float[Array, "3"]:
-    roll, pitch, yaw = vector.components(rpy)
-    turn = jnp.where(yaw < -jnp.pi, 1, jnp.where(yaw > jnp.pi, -1, 0))
-    return jnp.stack([roll, pitch, yaw + 2 * jnp.pi * turn])

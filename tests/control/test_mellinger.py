@@ -96,3 +96,29 @@ def test_a_lasting_heading_error_is_integrated():
         torques.append(float(command.torque[2]))
     np.testing.assert_allclose(torques[1] / torques[0], (60000 + 2 * 500 * DT) / (60000 + 500 * DT), rtol=1e-9)
     assert torques[0] > 0
+
+
+def test_without_thrust_the_motors_stand_still_and_integrators_are_empty():
+    turned = LEVEL.replace(quat=rotation.from_rpy(jnp.array([0.1, 0, 0.2])))
+    full = mellinger.init().replace(pos_integral=jnp.ones(3), attitude_integral=jnp.ones(3))
+    memory, command = mellinger.pwm(mellinger.gains(), full, turned, Setpoint.at(jnp.array([0, 0, -9.0])))
+    for x in command.pwm, command.torque, memory.pos_integral, memory.attitude_integral:
+        np.testing.assert_array_equal(x, 0)
+
+
+def test_rates_are_damped_from_the_first_call_on_without_a_kick_and_up_to_the_limit_of_the_torque():
+    gains, target = mellinger.gains(), Setpoint.at(LEVEL.pos)
+    for rate in 1.0, 5.0:
+        turning = LEVEL.replace(omega=jnp.array([rate, 0, 0]))
+        memory = mellinger.init()
+        for _ in range(2):
+            memory, command = mellinger.pwm(gains, memory, turning, target)
+            np.testing.assert_allclose(command.torque, [-min(20000 * rate, 32000), 0, 0], rtol=1e-9, atol=1e-6)
+
+
+def test_an_acceleration_of_the_setpoint_takes_its_thrust_and_the_heading_error_is_integrated_up_to_a_limit():
+    target = Setpoint.at(LEVEL.pos, acc=jnp.array([0, 0, 2.0]))
+    wound = mellinger.init().replace(attitude_integral=jnp.array([9.0, -9, 2000]))
+    memory, command = mellinger.pwm(mellinger.gains(), wound, LEVEL, target)
+    np.testing.assert_allclose(command.thrust, 132000 * 0.029 * 11.81)
+    np.testing.assert_array_equal(memory.attitude_integral, [1, -1, 1500])

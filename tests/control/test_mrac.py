@@ -57,6 +57,11 @@ def test_it_commands_and_learns_what_was_recorded(recorded):
     np.testing.assert_allclose(gains.feedforward + last.feedforward, arrays["Kr_end"], rtol=0, atol=1e-9)
 
 
+def test_a_tilt_accelerates_the_model_by_the_gravity_of_the_drone():
+    a, _ = mrac._hover(np.array(0.03), np.ones(3), np.array(3.7))
+    assert [a[6, 4], a[7, 3]] == [3.7, -3.7]
+
+
 def test_the_model_settles_at_the_target():
     gains = mrac.gains()
     gains = jax.tree.map(np.asarray, gains)

@@ -103,8 +103,9 @@ def test_the_inner_loop_compensates_the_gyroscopic_torque():
     state = State(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), omega, jnp.zeros(4))
 
     @jax.jit
-    def turning():
-        rpm = rates.follow(gains, params, state, params.gravity, commanded)
+    def turning(collective):
+        rpm = rates.follow(gains, params, state, collective, commanded)
         return newton_euler(params, state, rotor_wrench(params, state.replace(rpm=rpm)))[1]
 
-    np.testing.assert_allclose(turning(), gains.rate * (commanded - omega), rtol=1e-9)
+    np.testing.assert_allclose(turning(params.gravity), gains.rate * (commanded - omega), rtol=1e-9)
+    np.testing.assert_array_equal(turning(-params.gravity), turning(0 * params.gravity))  # rotors cannot pull

@@ -120,8 +120,9 @@ def test_a_position_is_followed_at_once_after_an_attitude_was_for_10_ms(dt):
     memory = firmware_pid.init().replace(age=jnp.array(0.004))
     for _ in range(3):
         memory, _ = call(memory, LEVEL, firmware_pid.Attitude(jnp.zeros(3), jnp.array(36000.0)))
-    _, command = call(memory, LEVEL, setpoint((0.5, 0, 1)))
+    memory, command = call(memory, LEVEL, setpoint((0.5, 0, 1)))
     np.testing.assert_allclose(command.attitude[:2], [0, -20], atol=1e-9)
+    np.testing.assert_allclose(memory.vel_integral[0], max(dt, 0.01))  # of an error of 1 m/s over a period
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +218,11 @@ def test_a_mode_of_one_axis_leaves_the_others_alone():
     def command(**given):
         return pwm(gains, firmware_pid.init(), LEVEL, per_axis(**given))[1]
 
-    mixed = command(by_pos=(False, False, True), pos=[5.0, 5, 1.2], vel=[0.4, -0.3, 5])  # as hover set-points are
+    hover = dict(by_pos=(False, False, True), pos=[5.0, 5, 1.2], vel=[0.4, -0.3, 5])  # as hover set-points are
+    mixed = command(**hover)
+    memory, _ = pwm(gains, firmware_pid.init(), LEVEL, per_axis(**hover))
+    np.testing.assert_allclose(memory.pos_integral, [0, 0, 0.2 * 0.01], atol=1e-12)
+    assert command(tilt=True, direct=True, thrust=7e4).thrust == firmware_motors.FULL
     along, up = command(by_pos=(False,) * 3, vel=[0.4, -0.3, 0]), command(pos=[0.0, 0, 1.2])
     np.testing.assert_allclose(mixed.attitude, along.attitude)
     np.testing.assert_allclose(mixed.thrust, up.thrust)
@@ -299,7 +304,7 @@ def test_gains_of_a_vehicle_that_cannot_yaw_leave_yaw_out_and_without_gravity_th
         controller.gains(params.replace(gravity=jnp.zeros(())))
 
 
-def test_an_attitude_that_was_followed_before_rates_is_not_integrated_after_them():
+def test_an_attitude_that_was_followed_before_rates_is_neither_integrated_after_them_nor_differentiated_across_them():
     """As by the firmware, which resets the loop of attitudes while it follows rates."""
     state, gains, thrust = one(hovering(team_of("cf2x"))), firmware_pid.gains(), jnp.asarray(30_000.0)
     fly = jit_unoptimized(lambda memory, setpoint: firmware_pid.pwm(gains, memory, state, setpoint)[0])
@@ -307,6 +312,8 @@ def test_an_attitude_that_was_followed_before_rates_is_not_integrated_after_them
     assert np.all(np.abs(memory.attitude_integral) > 0.01)
     memory = fly(memory, firmware_pid.Rates(omega=jnp.zeros(3), thrust=thrust))
     np.testing.assert_array_equal(memory.attitude_integral, 0)
+    far = memory.replace(rpy=jnp.full(3, 50.0))
+    np.testing.assert_array_equal(fly(far, firmware_pid.Rates(omega=jnp.zeros(3), thrust=thrust)).rpy, memory.rpy)
 
 
 def test_integrators_of_rates_and_attitude_are_limited():
@@ -317,6 +324,14 @@ def test_integrators_of_rates_and_attitude_are_limited():
     _, rates = firmware_loops.attitude_loop(gains, memory, LEVEL, jnp.zeros(3), DT)
     np.testing.assert_allclose(torque, [500 * 33.3, -500 * 33.3, 16.7 * 166.7])
     np.testing.assert_allclose(rates, [3 * 20, 3 * 20, 360])
+
+
+def test_a_rate_that_rises_is_braked_and_the_torque_is_a_signed_number_of_16_bits():
+    gains, memory = firmware_pid.gains(), firmware_pid.init()
+    _, braking = firmware_loops.rate_loop(gains, memory.replace(rates=-jnp.ones(3)), LEVEL, jnp.zeros(3), DT)
+    np.testing.assert_allclose(braking, [-2.5 / DT, 2.5 / DT, 0])
+    _, torque = firmware_loops.rate_loop(gains, memory, LEVEL, jnp.full(3, 1e6), DT)
+    np.testing.assert_array_equal(torque, [32767, -32767, 32767])
 
 
 def test_a_heading_that_crosses_half_a_turn_has_no_kick():

@@ -9,6 +9,7 @@ from helpers import jit_unoptimized, mostly_slow
 import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
 from jaxdrones.sensing import Box, Sphere
+from jaxdrones.sensing.frustum import placed_in
 from jaxdrones.sensing.images import view_of
 from jaxdrones.sensing.visibility import depth, surfaces, visible
 
@@ -22,7 +23,7 @@ def look(scene: Scene, dtype: type) -> list[np.ndarray]:
     state = jax.tree.map(lambda x: x[0], State.at_rest(jnp.zeros((1, 3)))).replace(quat=quat)
     view = jax.tree.map(lambda x: jnp.asarray(x, dtype), view_of(CAMERA, CRAZYFLIE, state))
     solids = [kind.replace(active=None) for kind in scene.shapes(dtype)]
-    active = [jnp.ones(len(kind.pos), bool) for kind in solids]
+    active = [kind.active for kind in scene.shapes(dtype)]
 
     @jax.jit
     def passes(view, solids):
@@ -48,10 +49,25 @@ def test_all_passes_see_the_same(dtype):
 
 @pytest.mark.parametrize("others", mostly_slow([0, 3000], [3000]))
 def test_a_wall_hides_another_one_a_millimeter_behind(others):
-    """Among three thousand solids, too: an index takes no more bits of a depth than there are to spare."""
-    pos = np.array([[10.501, 0, 0], [10.5, 0, 0]] + [[-50.0, 0, 0]] * others)
-    index = look(Scene.of(Box(pos=pos, size=(1.0, 100.0, 100.0)), ground=False), np.float32)[1]
+    """Among three thousand solids, too: an index takes no more bits of a depth than there are to spare.
+
+    The others are in front, but inactive.
+    """
+    pos = np.array([[10.501, 0, 0], [10.5, 0, 0]] + [[5.0, 0, 0]] * others)
+    walls = Box(pos=pos, size=(1.0, 100.0, 100.0), active=np.arange(2 + others) < 2)
+    index = look(Scene.of(walls, ground=False), np.float32)[1]
     np.testing.assert_array_equal(index, 1)
+
+
+@pytest.mark.parametrize("side", [1, 2])
+def test_a_ball_beside_the_view_is_in_it_as_far_as_its_radius_reaches(side):
+    view = view_of(CAMERA, CRAZYFLIE, jax.tree.map(lambda x: x[0], State.at_rest(jnp.zeros((1, 3)))))
+    slope = np.max(np.abs(view.u if side == 1 else view.v))
+    outward, edge = (np.array([x, 0.0, 0.0]) for x in (-slope, 1.0))
+    outward[side], edge[side] = 1.0, slope
+    for beyond in 0.9, 1.1:
+        ball = Sphere(pos=5 * edge + beyond * outward / np.linalg.norm(outward), radius=1.0)
+        assert placed_in(view, ball).in_view(view) == (beyond < 1)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.engine import bullet
 from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Scene, Sphere, Urdf, collisions, gate
+from jaxdrones.sensing.collisions import met_on_the_way
 
 CRAZYFLIE = jaxdrones.load_params("cf2x")
 RADIUS, HEIGHT = 0.06, 0.025  # m, of the cf2x
@@ -59,13 +60,24 @@ def test_a_tilted_drone_touches_the_ground_with_its_lowest_edge(roll):
 def test_what_is_not_active_is_not_touched():
     for active in True, False:
         ball = Scene.of(Sphere(pos=(0, 0, 1), radius=0.1, active=active))
-        assert flags(*team((0, 0, 1.1)), ball).scene.tolist() == [active]
+        for margin, height in (0.0, 1.1), (0.1, 1.2):
+            assert flags(*team((0, 0, height)), ball, margin).scene.tolist() == [active]
 
 
 def test_the_cylinder_of_an_hb_is_below_its_centre_of_mass():
     hb = jaxdrones.load_params("hb")
     for height, touches in (0.1505, True), (0.152, False):
         assert flags(*team((0, 0, height), vehicle=hb)).ground.tolist() == [touches]
+    above = 0.15 + 2 * float(hb.collision_offset)  # where it is upside down
+    for height, touches in (above + 0.0005, True), (above + 0.002, False):
+        assert flags(*team((0, 0, height), vehicle=hb, rpy=(np.pi, 0, 0))).ground.tolist() == [touches]
+
+
+def test_drones_that_flew_through_each_other_met_on_the_way_and_those_side_by_side_did_not():
+    params, state = team((1, 0, 5), (-1, 0, 5))
+    met = jit_unoptimized(met_on_the_way)
+    for before, expected in (([[-1.0, 0, 5], [1, 0, 5]], True), ([[1.0, -2, 5], [-1, -2, 5]], False)):
+        assert met(params, state, jnp.array(before), 1e-3).tolist() == [expected] * 2
 
 
 @pytest.mark.parametrize(

@@ -123,6 +123,20 @@ def test_what_a_camera_takes_for_the_normal_is_outward_where_a_point_is_on_the_s
     np.testing.assert_allclose(found(RNG.uniform(-1, 1, (100, 4, 3)) * reach), 1, rtol=1e-9)
 
 
+def test_of_the_ground_and_solids_of_several_kinds_the_nearest_ones_are_found():
+    scene = Scene.of(Box(pos=(2, 0, 5), size=(1, 1, 1)), Sphere(pos=(-2, 0, 5), radius=0.5))
+
+    @jit_unoptimized
+    def found(point):
+        return scene.nearest(point).point, scene.nearest_few(point, 2).point
+
+    wall, ball = [1.5, 0, 5], [-1.5, 0, 5]
+    for point, expected in (([1.0, 0, 5], [wall, ball]), ([-1.0, 0, 5], [ball, wall]), ([0.1, 0, 2], [[0.1, 0, 0]])):
+        nearest, few = found(jnp.array(point))
+        np.testing.assert_allclose(nearest, expected[0], atol=1e-12)
+        np.testing.assert_allclose(few[: len(expected)], expected, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_the_nearest_surface_is_a_distance_away_along_its_normal():
     """Inside and outside; the normal is the gradient of the distance."""

@@ -81,8 +81,9 @@ def test_a_disc_that_turns_into_a_wall_beside_it_meets_it():
 
 
 def test_three_walls_of_a_corner_are_three_planes_and_what_is_behind_is_none():
-    corner = Scene.of(*(Box(pos=0.5 * np.eye(3)[i], size=np.full(3, 2.0) - 1.4 * np.eye(3)[i]) for i in range(3)))
-    kinds = corner.shapes(jnp.float64)  # faces at x, y, z = 0.2 m
+    walls = [Box(pos=0.5 * np.eye(3)[i], size=np.full(3, 2.0) - 1.4 * np.eye(3)[i]) for i in range(3)]
+    corner = Scene.of(*walls, walls[0].replace(pos=(0.52, 0, 0)))
+    kinds = corner.shapes(jnp.float64)  # faces at x, y, z = 0.2 m, and at x = 0.22 m
     level = jnp.array([0.0, 0.0, 1.0])
 
     def disc(center):
@@ -95,3 +96,5 @@ def test_three_walls_of_a_corner_are_three_planes_and_what_is_behind_is_none():
     np.testing.assert_allclose(found.normals, -np.eye(3)[order], atol=1e-6)
     np.testing.assert_allclose(found.heights, -0.2, atol=1e-6)
     assert not planes_of([0.0, 0.0, 0.0], [-0.4, -0.4, -0.4]).normals.any()
+    for end in 0.14, 0.4:  # up to the first of the walls that face -x, by the rounding; and through both
+        np.testing.assert_allclose(planes_of([0.0, 0.0, 0.0], [end, 0.0, 0.0]).normals, -np.eye(3) * np.eye(3)[0])

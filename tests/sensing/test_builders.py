@@ -7,7 +7,7 @@ import pytest
 from helpers import jit_unoptimized
 
 from jaxdrones import rotation
-from jaxdrones.sensing import BEAMS, Scene, builders, forest, gate, room, track
+from jaxdrones.sensing import BEAMS, Scene, Sphere, builders, forest, gate, room, track
 
 KEYS = jax.random.split(jax.random.key(0), 4096)
 ENDS = jnp.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5]])
@@ -56,7 +56,14 @@ def test_trunks_stand_with_their_foot_in_the_strip_and_tilt_to_all_sides_as_far_
     assert np.all((foot >= corners[0] - 1e-9) & (foot <= corners[1]))
     tilt = np.degrees(np.arccos(axes[:, 2]))
     assert tilt.max() <= 20 + 1e-9 and np.all(np.histogram(tilt, 4, (0, 20))[0] > 90)  # of 125
-    assert np.abs(axes[:, :2].mean(axis=0)).max() < 0.02 and np.all((radius >= 0.1) & (radius <= 0.3))
+    assert np.abs(axes[:, :2].mean(axis=0)).max() < 0.02
+    assert 0.1 <= radius.min() < 0.11 and 0.29 < radius.max() <= 0.3
+
+
+def test_what_is_free_is_far_from_all_places():
+    balls = Scene.of(Sphere(pos=np.array([[0, 0, 1], [5, 0, 1], [2, 9, 1]]), radius=0.5)).shapes(float)[0]
+    places = jnp.array([[0.0, 0, 1], [5, 0, 1]])
+    assert builders._is_free(balls, places, 1.0).tolist() == [False, False, True]
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from helpers import jit_unoptimized, mostly_slow
 import jaxdrones as jd
 from jaxdrones import optimal, rotation
 from jaxdrones.control import Setpoint, for_team, pid
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.optimal import ilqr, lqr, mppi
 from jaxdrones.optimal.ilqr import box_qp
@@ -190,11 +191,15 @@ def test_a_planner_moves_its_plan_on_by_a_step_or_drops_it_and_holds_its_command
         assert not np.array_equal(jax.random.key_data(after.key), jax.random.key_data(memory.key))
 
 
-def test_a_reference_turns_as_fast_as_its_heading_also_by_a_radian_in_a_step():
+def test_a_reference_turns_as_fast_as_its_heading_also_by_a_radian_in_a_step_and_its_load_hangs_below():
     params, dt, rate = jd.load_params("cf2x"), 0.1, -10.0  # s, rad/s
-    setpoints = Setpoint.at(jnp.zeros((6, 3)), yaw=3 + rate * dt * jnp.arange(6))
-    omega = jit_unoptimized(lambda: optimal.reference(params, setpoints, {}, dt).state.omega)()
-    np.testing.assert_allclose(omega, np.tile([0, 0, rate], (6, 1)), atol=1e-12)
+    places = jnp.arange(18.0).reshape(6, 3)
+    setpoints = Setpoint.at(places, vel=places[::-1], yaw=3 + rate * dt * jnp.arange(6))
+    load = PointMass(jnp.array([0, 0, -0.5]), jnp.zeros(3))
+    state = jit_unoptimized(lambda: optimal.reference(params, setpoints, {"load": load}, dt).state)()
+    np.testing.assert_allclose(state.omega, np.tile([0, 0, rate], (6, 1)), atol=1e-12)
+    np.testing.assert_array_equal(state.aux["load"].pos, places - jnp.array([[0, 0, 0.5]]))
+    np.testing.assert_array_equal(state.aux["load"].vel, setpoints.vel)
 
 
 def test_the_rotor_speeds_of_a_reference_obey_eulers_equation():
@@ -211,14 +216,15 @@ def test_the_rotor_speeds_of_a_reference_obey_eulers_equation():
     def planned():
         reference = optimal.reference(params, jax.vmap(along)(dt * jnp.arange(6)), {}, dt)
         torque = jax.vmap(lambda state: rotor_wrench(params, state).torque)(reference.state)
-        return torque[1], reference.state.omega
+        return torque, reference.state.omega
 
     torque, omega = map(np.asarray, planned())
     momentum = np.asarray(params.inertia) * omega
-    turning = np.cross(omega[1], momentum[1])
-    expected = (momentum[2] - momentum[1]) / dt + turning
-    assert np.linalg.norm(turning) > 0.1 * np.linalg.norm(expected)
-    np.testing.assert_allclose(torque, expected, rtol=1e-6, atol=1e-9)
+    for k, first in (1, 1), (4, 3), (5, 3):  # the last difference is also that of the last two rows
+        turning = np.cross(omega[k], momentum[k])
+        expected = (momentum[first + 1] - momentum[first]) / dt + turning
+        assert np.linalg.norm(turning) > 0.1 * np.linalg.norm(expected)
+        np.testing.assert_allclose(torque[k], expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow

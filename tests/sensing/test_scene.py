@@ -192,7 +192,7 @@ ARM = """<robot name="arm">
   <link name="tip">
     <collision><origin xyz="0 0 1" rpy="1.5707963 0 0"/>
       <geometry><cylinder radius="0.1" length="2"/></geometry></collision>
-    <collision><geometry><sphere radius="0.2"/></geometry></collision>
+    <collision><origin xyz="0.5 0 0"/><geometry><sphere radius="0.2"/></geometry></collision>
     <collision><geometry><capsule radius="0.1" length="1"/></geometry></collision>
     <collision><geometry><mesh filename="a.obj" scale="2 2 2"/></geometry></collision></link>
   <joint name="j" type="revolute"><parent link="base"/><child link="tip"/>
@@ -221,10 +221,12 @@ def test_a_scene_from_a_urdf_has_its_shapes_where_its_links_are(tmp_path):
     assert scene.boxes.color[0].tolist() == [1, 0, 0, 1]
     np.testing.assert_allclose(scene.boxes.pos[0], [5, 0, 0.5])
     np.testing.assert_allclose(scene.cylinders.pos[0], [5, 0, 2], atol=1e-6)
+    np.testing.assert_allclose(scene.spheres.pos[0], [5, 0.5, 1], atol=1e-6)
     without = scene.replace(meshes=())
     assert is_inside(without, (5.9, 0, 2)) and not is_inside(without, (5, 0.9, 2))  # the cylinder lies along x
     assert scene.meshes[0].scale == 2 and scene.meshes[0].pos == pytest.approx((5, 0, 1))
     turned = from_urdf(file, quat=QUARTER_TURN).replace(meshes=())
+    np.testing.assert_allclose(turned.spheres.pos[0], [-0.5, 0, 1], atol=1e-6)
     assert turned.ground and is_inside(turned, (0, 0.9, 2)) and not is_inside(turned, (0.9, 0, 2))
 
 

@@ -36,11 +36,18 @@ def test_the_riccati_solution_is_that_of_scipy():
     np.testing.assert_allclose(value, scipy.linalg.solve_discrete_are(a, b, q, r), rtol=1e-9)
 
 
-def test_a_displacement_is_the_inverse_of_a_difference():
+def test_a_displacement_is_the_inverse_of_a_difference_whatever_the_sign_of_the_quaternion():
     params, state = some_state()
     z = 1e-4 * jnp.asarray(np.random.default_rng(1).normal(size=16))
-    found = jax.jit(lambda z: optimal.difference(params, optimal.displaced(params, state, z), state))(z)
-    np.testing.assert_allclose(found, z, rtol=0, atol=1e-12)  # the rotation errs by the third power of 1e-4
+
+    @jax.jit
+    def found(z, sign):
+        return optimal.difference(params, displaced(params, state.replace(quat=sign * state.quat), z), state)
+
+    for sign in 1, -1:
+        np.testing.assert_allclose(
+            found(z, sign), z, rtol=0, atol=1e-12
+        )  # the rotation errs by the third power of 1e-4
 
 
 @pytest.mark.slow
@@ -205,6 +212,14 @@ def test_from_afar_a_drone_approaches_at_the_speed_from_which_it_stops_at_the_ta
             speed = np.sqrt(2 * acc * distance - (acc / rate) ** 2)
             there = reference.replace(pos=jnp.array(distance * direction), vel=jnp.array(-speed * direction))
             np.testing.assert_allclose(feedback(params, gain, there, reference), reference.rpm, rtol=1e-9)
+
+
+def test_a_far_target_is_moved_towards_the_drone_together_with_its_load():
+    params, reference, gain = regulator()
+    target = reference.replace(aux={"load": PointMass(jnp.array([0, 0, -0.5]), jnp.zeros(3))})
+    moved = lqr._on_the_way(params, gain, target.replace(pos=jnp.array([9.0, -2, 1])), target)
+    assert np.linalg.norm(moved.pos) > 1
+    np.testing.assert_allclose(moved.aux["load"].pos, moved.pos - jnp.array([0, 0, 0.5]))
 
 
 @pytest.mark.parametrize("side", [-1, 1])

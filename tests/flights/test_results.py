@@ -96,6 +96,15 @@ def test_a_flight_by_another_clock_has_the_same_results(begin):
     assert "all other numbers count from 1001.0" in definitions(dataclasses.replace(record, t=record.t + 1e3), 1.005)
 
 
+def test_extremes_count_from_the_given_time_on():
+    record = changed(hovering(), "pos", slice(0, 50), [9, 0, -9])
+    for rows, height, climb in (slice(0, 50), -9, 9), (slice(60, 62), 3, 4), (slice(62, 64), 0.5, -5):
+        record = changed(changed(record, "pos", rows, [9, 0, height]), "vel", rows, [0, 0, climb])
+    found = results(record, 0.505)[1]
+    assert found["lowest_z_m"] == 0.5 and found["highest_z_m"] == 3 and found["peak_vz_m_s"] == 4
+    assert found["peak_speed_m_s"] == 5 and found["peak_error_m"] == pytest.approx(np.hypot(9, 2))
+
+
 @pytest.mark.parametrize(("last", "settled"), [(150, 1.5), (1, 0.01), (0, 0.0), (310, None)])
 def test_a_drone_has_settled_where_its_error_stays_in_the_band_for_the_first_time(last, settled):
     """Its error leaves the band in row `last` - 1 for the last time; the last quarter begins in row 299."""

@@ -13,11 +13,13 @@ from helpers import jit_unoptimized, mostly_slow
 import jaxdrones as jd
 from jaxdrones import optimal, rotation
 from jaxdrones.control import Setpoint, for_team, pid
+from jaxdrones.control.allocation import mixer
 from jaxdrones.dynamics.model import PointMass
 from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.optimal import ilqr, lqr, mppi
 from jaxdrones.optimal.ilqr import box_qp
 from jaxdrones.optimal.mppi import importance
+from jaxdrones.optimal.problem import Reference
 from jaxdrones.status import PlanningError, Status
 from jaxdrones.tasks.curves import SHAPES, setpoint_on
 
@@ -63,6 +65,29 @@ def test_importance_prefers_what_costs_less_and_leaves_out_what_is_not_finite():
     law = np.exp(-above / (0.5 * np.sqrt(np.mean(above**2))))
     np.testing.assert_allclose(weights[[0, 1, 3]], law / np.sum(law), rtol=1e-12)
     np.testing.assert_allclose(jax.jit(importance)(jnp.ones(4), 0.5), 0.25, rtol=1e-12)
+
+
+def test_noise_is_held_and_is_collective_roll_pitch_and_yaw_of_the_rotors():
+    params, settings = jd.load_params("cf2x"), mppi.settings(None, horizon=8, samples=2000, hold=3)
+    noise = np.asarray(mppi._noise(jax.random.key(0), settings, params, jnp.zeros((8, 4))))
+    for first, last in (0, 3), (3, 6), (6, 8):
+        np.testing.assert_array_equal(
+            noise[:, first:last], np.repeat(noise[:, first : first + 1], last - first, axis=1)
+        )
+    assert noise.shape == (2000, 8, 4) and np.all(noise[:, 0] != noise[:, 3])
+    shares = np.linalg.inv(np.concatenate([np.ones((4, 1)), mixer(params)], axis=1))
+    np.testing.assert_allclose(np.std(noise[:, 0] @ shares.T, axis=0), [0.05, 0.02, 0.02, 0.02], rtol=0.05)
+
+
+def test_the_cost_of_a_plan_is_half_of_the_weighted_squares_of_errors_commands_and_end():
+    """Of a drone that stays 0.1 m beside its target, without feedback."""
+    params, at_rest = one(team_of("cf2x")), one(hovering(team_of("cf2x")))
+    target = jax.tree.map(lambda x: jnp.tile(x[None], (4, *[1] * x.ndim)), Reference(at_rest, at_rest.rpm))
+    regulator = lqr.Memory(jnp.zeros((4, 16)), 7 * jnp.eye(16), at_rest.rpm, jnp.zeros(()))
+    plan = 0.01 * jnp.arange(12.0).reshape(3, 4)
+    beside, settings = at_rest.replace(pos=at_rest.pos.at[0].add(0.1)), mppi.settings(lambda team, state, rpm: state)
+    cost = jit_unoptimized(functools.partial(mppi.cost, settings))(params, beside, target, plan, regulator)
+    np.testing.assert_allclose(cost, (3 * 1000 * 0.1**2 + 10 * np.sum(plan**2) + 7 * 0.1**2) / 2, rtol=1e-9)
 
 
 @functools.cache

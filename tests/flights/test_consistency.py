@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from jaxdrones import assets
 from jaxdrones.cli import main
 from jaxdrones.flights import inconsistencies, load_flights
-from jaxdrones.flights.consistency import contradictions
-from jaxdrones.flights.motion_tests import Motion
+from jaxdrones.flights.consistency import _check_drift, contradictions
+from jaxdrones.flights.motion_tests import Motion, MotionTest, shift_test
 
 NED = np.array([1, -1, -1])
 SIGNS = np.array([1, -1, -1, 1])
@@ -175,8 +175,29 @@ def test_rows_at_uneven_times_are_resampled(columns, tmp_path):
     np.testing.assert_allclose(log.rpm[:, 0, 0], 15_000 + 1000 * np.sin(3 * log.t), atol=0.012**2 / 8 * 9000)
 
 
-def test_even_rows_stay_as_they_are(columns, tmp_path):
-    log = load(tmp_path, columns)
+def test_rows_that_are_mostly_too_far_apart_are_refused(columns, tmp_path):
+    t = 2 * columns["t"]
+    t[2] = t[1] + 0.005
+    with pytest.raises(ValueError, match=r"rows are 0\.02 s apart; record them at least every 0\.012 s"):
+        load(tmp_path, columns | {"t": t})
+
+
+def test_an_integral_of_the_velocity_is_exact_for_a_steady_acceleration():
+    t = np.arange(200)[:, None] * 0.01 * np.array([1.0, -2, 3])
+    test = shift_test(t**2 / 2, t * np.array([1.0, -2, 3]))
+    np.testing.assert_allclose(test.implied, test.has, atol=1e-12)
+
+
+@pytest.mark.parametrize("halves", [(1.0, 1.2), (1.2, 1.0), (1.1, 1.1)])
+def test_a_scale_of_distances_that_rises_or_falls_is_a_wrong_clock(halves):
+    way = np.random.default_rng(0).normal(size=(40, 3))
+    test = MotionTest(way * np.repeat(halves, 20)[:, None], way, 0.01, 0.05, 0.03)
+    assert len(_check_drift(test)) == (halves[0] != halves[1])
+
+
+def test_even_rows_stay_as_they_are_and_rotor_speeds_leave_out_the_pwm(columns, tmp_path):
+    log = load(tmp_path, columns | {"pwm": np.full_like(columns["rpm"], 3e4)})
+    assert not log.has("pwm")
     for name in ("pos", "vel", "omega", "rpm"):
         np.testing.assert_array_equal(getattr(log, name)[:, 0], columns[name])
     np.testing.assert_array_equal(log.t, columns["t"])

@@ -31,7 +31,7 @@ from jaxdrones.flights import (
 )
 from jaxdrones.flights.fit import Estimate, Report, _estimate, _Problem
 from jaxdrones.flights.least_squares import spread, standard_errors
-from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals
+from jaxdrones.flights.open_loop import _rotor_speed, _shifted, residuals, window_starts
 from jaxdrones.flights.parameters import PARAMETERS, check_guess, value_of, with_parameters
 from jaxdrones.flights.path_fit import _balance_residuals, _least_squares
 from jaxdrones.flights.preparation import named_apart
@@ -118,6 +118,20 @@ def test_rotors_follow_the_pwm_between_the_rows():
     command = jnp.stack([*[7 * rows] * 4, jnp.ones(93), jnp.zeros(93)], axis=1)
     speed, _ = _rotor_speed(Vehicle.of(params), command, motors)
     np.testing.assert_allclose(speed[:, 0], 7 * (36.5 - 5 + np.arange(50)), atol=7 * 0.03)
+
+
+def test_a_window_is_in_flight_from_its_start_to_its_last_horizon():
+    """Fifty rows after its start, which are fifty-one."""
+    zero = np.zeros((90, 1, 3))
+    for rows, starts in (52, [10, 11]), (51, [10]), (50, None):
+        pwm = np.zeros((90, 1, 4))
+        pwm[10 : 10 + rows] = 3e4
+        log = FlightLog(0.01 * np.arange(90), zero, np.ones((90, 1, 4)) / 2, zero, zero, pwm=pwm)
+        if starts is None:
+            with pytest.raises(ValueError, match=r"motors never run for 0\.5 s without interruption"):
+                window_starts(log)
+        else:
+            np.testing.assert_array_equal(window_starts(log), starts)
 
 
 @pytest.mark.parametrize("delay", [-7.0, -0.5, 0.0, 5.8, 6.5, 20.0])

@@ -1,6 +1,7 @@
 """The four flights do what figures 6 to 9 of the gym-pybullet-drones paper show."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -113,9 +114,27 @@ def test_the_start_and_the_samples_of_a_seed_are_drawn_from_different_keys():
     assert not np.any(np.all(jax.random.key_data(memory.key) == of_start, axis=-1))
 
 
+def test_every_drone_plans_with_a_key_of_its_own_for_the_targets_from_now_on(monkeypatch):
+    planner = dict(
+        settings=lambda step: SimpleNamespace(horizon=2),
+        init=lambda settings, params, state, key: key,
+        control=lambda settings, params, memory, state, setpoints, dt: (memory, setpoints.pos),
+    )
+    for name, function in planner.items():
+        monkeypatch.setattr(optimal.mppi, name, function)
+    conditions, t = Conditions("circle", controller="mppi", seed=3, feedforward=False), 0.5
+    team, start = repeat(load_params("cf2x"), conditions.drones), FLIGHTS["circle"].start(conditions.drones)
+    controller = controller_of(conditions)
+    keys, seen = controller.control(team, controller.init(team, start), start, jnp.array(t))
+    assert len(np.unique(jax.random.key_data(keys), axis=0)) == conditions.drones
+    ahead = [FLIGHTS["circle"].target(conditions.drones, t + k * conditions.dt, 12.0).pos for k in range(3)]
+    np.testing.assert_allclose(seen, np.stack(ahead, axis=1), rtol=1e-12)
+
+
 def test_progress_goes_from_nothing_to_all():
     told = []
-    fly("circle", drones=1, duration=1.0, progress=told.append)
+    record = fly("circle", drones=1, duration=1.0, progress=told.append)
+    np.testing.assert_allclose(record.t, np.arange(1, 121) / 120, rtol=1e-6)  # rows are states after control steps
     assert sorted(told)[-1] == 1.0 and len(told) > 50
 
 

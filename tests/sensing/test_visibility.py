@@ -53,8 +53,8 @@ def test_a_wall_hides_another_one_a_millimeter_behind(others):
 
     The others are in front, but inactive.
     """
-    pos = np.array([[10.501, 0, 0], [10.5, 0, 0]] + [[5.0, 0, 0]] * others)
-    walls = Box(pos=pos, size=(1.0, 100.0, 100.0), active=np.arange(2 + others) < 2)
+    pos = np.array([[10.501, 0, 0], [10.5, 0, 0], [12, 0, 0]] + [[5.0, 0, 0]] * others)
+    walls = Box(pos=pos, size=(1.0, 100.0, 100.0), active=np.arange(3 + others) < 3)
     index = look(Scene.of(walls, ground=False), np.float32)[1]
     np.testing.assert_array_equal(index, 1)
 

@@ -41,6 +41,34 @@ def test_a_box_constrained_program_has_the_cost_of_the_best_of_all_active_sets()
         assert np.all((x >= low) & (x <= high)) and np.array_equal(free, (x > low) & (x < high))
 
 
+def test_a_backward_pass_over_a_linear_model_has_the_best_commands_and_keeps_within_their_bounds():
+    rng = np.random.default_rng(0)
+    a, b, root, slopes = (jnp.asarray(rng.normal(size=size)) for size in ((3, 2, 2), (3, 2, 4), (3, 2, 2), (3, 2)))
+    curvatures, commands = root @ jnp.swapaxes(root, 1, 2), jnp.full((3, 4), 10.0)
+    nominal = commands + jnp.asarray(rng.normal(size=(3, 4)))
+
+    def cost(change):
+        z, total = jnp.zeros(2), jnp.sum((commands + change - nominal) ** 2) / 2
+        for k in range(3):
+            z = a[k] @ z + b[k] @ change[k]
+            total += slopes[k] @ z + z @ curvatures[k] @ z / 2
+        return total
+
+    @jit_unoptimized
+    def found(high):
+        models = (a, b, slopes, curvatures, commands, nominal)
+        changes, gains = ilqr._backward(models, jnp.eye(4), high, jnp.zeros(()))
+        z, flown = jnp.zeros(2), []
+        for k in range(3):
+            flown.append(changes[k] + gains[k] @ z)
+            z = a[k] @ z + b[k] @ flown[-1]
+        return changes, jax.grad(cost)(jnp.stack(flown))
+
+    np.testing.assert_allclose(found(100.0)[1], 0, atol=1e-9)
+    limited = commands + found(10.2)[0]
+    assert np.all(limited <= 10.2) and np.any(limited == 10.2)
+
+
 _box_qp = jax.jit(box_qp)
 
 

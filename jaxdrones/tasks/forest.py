@@ -77,7 +77,7 @@ def forest(
             clearance=_CLEARANCE,
         )
 
-    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+    def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on one side of the forest."""
         reach = _REACH if drones == 1 else _REACH_OF_TEAM
         check_apart(params, _SPACING - 2 * reach[1])
@@ -85,14 +85,11 @@ def forest(
         goal = place + jnp.array([[length, 0, 0]], place.dtype)
         state = thrown(key, params, place, reach=reach, speed=0.5, omega=0.5, tilt=0.2)
         zero, false = jnp.zeros_like(params.mass), jnp.zeros(drones, bool)
-        return state, {
+        return state, touching.variables(params, state.pos, scene) | {
             "goal": goal,
             "start": state.pos,
-            "pos": state.pos,
             "progress": zero,
             "path": zero,
-            "clearance": zero + _CLEARANCE,
-            "touched": false,
             "reached": false,
             "arrives": false,
         }
@@ -147,7 +144,7 @@ def forest(
 
     return Task(
         name="forest",
-        summary="fly through a forest to a goal 20 m away",
+        summary=f"fly through a forest to a goal {length:g} m away",
         drones=drones,
         duration=duration,
         start=start,

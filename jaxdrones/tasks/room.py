@@ -54,7 +54,7 @@ def room(
     def scene(key: jax.Array) -> Scene:
         return build_room((size, size, ROOM_HEIGHT), key=key, pillars=pillars, keep_free=ring, clearance=_CLEARANCE)
 
-    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+    def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """Nearly at rest on a ring in the room."""
         apart = 2 * radius * math.sin(math.pi / drones) - 2 * math.sqrt(2) * _REACH
         check_apart(params, apart, "a smaller vehicle or fewer drones")
@@ -63,12 +63,7 @@ def room(
         state = thrown(start_key, params, places, reach=_REACH, speed=0.1, omega=0.1, tilt=0.1)
         goal = jnp.roll(places, jax.random.randint(order_key, (), 1, max(drones, 2)), axis=0)
         goal = -places + jnp.array([[0, 0, 2 * HEIGHT]], goal.dtype) if drones == 1 else goal
-        return state, {
-            "goal": goal,
-            "pos": state.pos,
-            "clearance": jnp.full(drones, _CLEARANCE, goal.dtype),
-            "touched": goal[:, 0] < -jnp.inf,
-        }
+        return state, touching.variables(params, state.pos, scene) | {"goal": goal}
 
     return Task(
         name="room",

@@ -8,7 +8,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
 from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
 from jaxdrones.quantity import described
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
@@ -77,9 +79,9 @@ def heading(task: Task, world: World) -> Float[Array, " n"]:
     return jax.vmap(of_drone)(world.drones.quat)
 
 
-def gap(world: World) -> Float[Array, " n"]:
+def gap(params: Params, pos: Float[Array, "n 3"], scene: Scene) -> Float[Array, " n"]:
     """Distance of every drone's center from the nearest obstacle or the ground, less its collision radius, m."""
-    return jax.vmap(world.scene.distance)(world.drones.pos) - world.params.collision_radius
+    return jax.vmap(scene.distance)(pos) - params.collision_radius
 
 
 def clearance(margin_time: float = 0.1) -> Term:

@@ -40,7 +40,7 @@ def balls_meet(world: World, before: Float[Array, "n 3"]) -> Bool[Array, " n"]:
     The way begins at the positions `before`. Obstacles are swept only in worlds in which one is within reach.
     """
     params, pos = world.params, world.drones.pos
-    gap = shaping.gap(world)
+    gap = shaping.gap(params, pos, world.scene)
 
     def swept(radius: Array, scene: Scene, before: Array, pos: Array) -> Array:
         kinds = merged(scene.shapes(pos.dtype))
@@ -57,14 +57,20 @@ def balls_meet(world: World, before: Float[Array, "n 3"]) -> Bool[Array, " n"]:
     return (gap < 0) | where_needed(swept, one_in=_ONE_IN)(within_reach, *args)
 
 
+def variables(params: Params, pos: Float[Array, "n 3"], scene: Scene) -> dict[str, Array]:
+    """Variables of `advance` at the start of an episode, at these positions."""
+    gap = shaping.gap(params, pos, scene)
+    return {"pos": pos, "clearance": gap, "touched": jnp.zeros(len(pos), bool)}
+
+
 def advance(task: Task, world: World) -> dict[str, Array]:
     """Task variables after a step: positions `pos`, smallest `clearance` (m) so far, and whether a drone `touched`."""
-    variables = world.variables
-    found = touches(world, variables["pos"], passing=True)
-    return variables | {
-        "pos": world.drones.pos,
-        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
-        "touched": variables["touched"] | found.ground | found.drones | found.scene,
+    before, pos = world.variables, world.drones.pos
+    found = touches(world, before["pos"], passing=True)
+    return before | {
+        "pos": pos,
+        "clearance": jnp.minimum(before["clearance"], shaping.gap(world.params, pos, world.scene)),
+        "touched": before["touched"] | found.ground | found.drones | found.scene,
     }
 
 

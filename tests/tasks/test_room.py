@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
-from jaxdrones.envs import make
+from jaxdrones import load_params, repeat
+from jaxdrones.envs import TASKS, make
+from jaxdrones.sensing import Scene
 
 ENV = functools.cache(lambda: make("room", drones=3))
 first_world = functools.cache(lambda: jit_unoptimized(ENV().reset)(jax.random.key(0))[1])
@@ -73,6 +75,14 @@ def test_success_is_arriving_within_20_cm_without_touching():
     errors = jnp.array([[1.0, 1.0, 1.0], [0.1, 0.3, 0.1]])  # time, drones
     touched = jnp.array([[0.0, 0, 0], [0, 0, 1]])
     np.testing.assert_array_equal(ENV().task.success({"error": errors, "touched": touched}, 0.02), [True, False, False])
+
+
+@pytest.mark.parametrize("name", ["room", "forest"])
+def test_the_clearance_begins_with_the_distance_from_the_ground_or_a_wall_however_large(name):
+    task = TASKS[name]()
+    params = repeat(load_params("cf2x"), task.drones)
+    state, variables = jit_unoptimized(task.begin)(jax.random.key(0), params, Scene())
+    np.testing.assert_allclose(variables["clearance"], state.pos[:, 2] - params.collision_radius, rtol=1e-12)
 
 
 def test_a_ring_has_room_for_so_many_drones():

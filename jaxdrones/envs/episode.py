@@ -92,7 +92,7 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
     scene = env.scene if isinstance(env.scene, Scene) else env.scene(jax.random.fold_in(key, SCENE))
     known = randomize.scaling_params(env.randomize, params, env.params)
     drones, variables = env.task.begin(jax.random.fold_in(key, START), known, scene, progress)
-    history = max(math.ceil(env.delay_steps[1]) + 1, *(term.history for term in env.terms))
+    history = max(2, math.ceil(env.delay_steps[1]) + 1, *(term.history for term in env.terms))  # 2 for `action_change`
     return World(
         params=params,
         drones=env.physics.init(params, drones),

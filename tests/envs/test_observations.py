@@ -59,3 +59,10 @@ def test_a_term_of_whole_numbers_is_clipped_as_the_same_real_numbers_are(dtype, 
         obs.append(jit_unoptimized(env.reset)(jax.random.key(0))[0])
     assert obs[0].dtype == obs[1].dtype
     np.testing.assert_array_equal(*obs)
+
+
+def test_a_change_of_the_action_is_penalized_also_where_one_action_is_observed():
+    env = make("hover", observation=("last_action",))
+    world = jit_unoptimized(env.reset)(jax.random.key(0))[1]
+    scale, term = env.task.rewards["action_change"]
+    assert scale * term(env.task, world.replace(actions=world.actions.at[:, -1].set(0.5)))[0] == scale

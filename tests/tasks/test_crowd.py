@@ -11,6 +11,7 @@ from helpers import jit_unoptimized, mostly_slow, mostly_slow_rows
 
 from jaxdrones import rotation
 from jaxdrones.envs import make
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.crowd import FLOOR
 from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
@@ -119,6 +120,8 @@ def test_drones_that_pass_between_two_control_steps_have_touched():
         np.testing.assert_array_equal(variables["touched"], [touches, touches, False])
         later = now.replace(variables=variables)
         np.testing.assert_array_equal(measure(later)["safe"], [not touches, not touches, True])
+        apart = later.replace(drones=later.drones.replace(pos=after + np.array([[0, -3, 0], [0, 0, 0], [0, 3, 0]])))
+        np.testing.assert_array_equal(advance(apart)["touched"], variables["touched"], "whoever touched has touched")
 
 
 @pytest.mark.float32
@@ -144,18 +147,25 @@ def test_a_ball_that_is_passed_between_two_control_steps_has_been_touched(speed)
             np.testing.assert_array_equal(advance(now), [touches, False])
 
 
-@pytest.mark.slow
 def test_a_drone_that_left_the_world_touches_nobody_on_the_way():
     """Drones that leave are moved far along x, here past another one."""
-    env = make("crowd", drones=3)
-    _, world = jit_unoptimized(env.reset)(jax.random.key(0))
     pos = jnp.array([[0.0, 0, 3], [1.0, 0, 3], [0, 3, 3]])
-    left = world.replace(
-        drones=world.drones.replace(pos=pos.at[0, 0].set(1e4)),
-        variables=world.variables | {"pos": pos},
+    left = SimpleNamespace(
+        params=SimpleNamespace(collision_radius=jnp.full(3, 0.06)),
+        drones=SimpleNamespace(pos=pos.at[0, 0].set(1e4)),
+        variables={"pos": pos, "touched": jnp.zeros(3, bool)},
         active=jnp.array([False, True, True]),
+        scene=Scene(),
     )
-    np.testing.assert_array_equal(env.task.advance(env.task, left)["touched"], [False, False, False])
+    np.testing.assert_array_equal(crossing.advance(None, left)["touched"], [False, False, False])
+
+
+def test_the_goal_is_seen_up_to_two_meters_and_approached_slower_within_80_cm():
+    goal, vel = jnp.array([[5.0, 0, 0], [0.4, 0, 0]]), jnp.array([[1.2, 0, 0], [0.6, 0, 0]])
+    task = SimpleNamespace(target_now=lambda world: SimpleNamespace(pos=goal))
+    world = SimpleNamespace(drones=SimpleNamespace(pos=jnp.zeros((2, 3)), vel=vel), variables={"goal": goal})
+    np.testing.assert_allclose(crossing._goal(task, world), [[2, 0, 0], [0.4, 0, 0]], atol=1e-3)
+    np.testing.assert_allclose(crossing._velocity(task, world), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [3, 4])

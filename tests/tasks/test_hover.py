@@ -1,15 +1,27 @@
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers import jit_unoptimized
+from scipy.spatial.transform import Rotation
 
 import jaxdrones as jd
 from jaxdrones import rotation
+from jaxdrones.envs import TASKS
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.starts import thrown
 
 EAST = jnp.array([[1.0, 0.0, 0.0]])
+TEAM = jd.repeat(jd.load_params("cf2x"), 3)
+
+
+def starts(name):
+    """States and goals of 300 teams of three, and their attitudes."""
+    begin = jax.vmap(lambda key: TASKS[name](drones=3).begin(key, TEAM, Scene()))
+    state, variables = jit_unoptimized(begin)(jax.random.split(jax.random.key(0), 300))
+    return state, variables["goal"], Rotation.from_quat(np.reshape(state.quat, (-1, 4)))
 
 
 def test_the_reward_for_precision_falls_with_distance_and_speed_and_is_steepest_at_rest_at_the_goal():
@@ -54,3 +66,36 @@ def test_the_numbers_of_a_random_start_are_drawn_for_themselves():
     state = jit_unoptimized(place)(jax.random.key(0), params, jnp.zeros((2, 3)))
     drawn = np.concatenate([state.pos, state.vel, state.omega], axis=1)
     assert len(np.unique(np.abs(drawn))) == drawn.size
+
+
+def test_a_hover_starts_tilted_about_any_axis_by_up_to_its_tilt():
+    turn = starts("hover")[2].as_rotvec()
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    assert angle.min() < 0.05 and np.pi / 2 - 0.05 < angle.max() <= np.pi / 2
+    axis = turn / angle
+    np.testing.assert_allclose(axis.T @ axis / len(axis), np.eye(3) / 3, atol=0.04)
+
+
+def test_a_recovery_starts_upside_down_and_a_landing_above_its_pad():
+    _, goal, attitude = starts("recovery")
+    assert -0.53 < attitude.as_matrix()[:, 2, 2].max() <= -0.5  # 60 degrees from upside down
+    np.testing.assert_allclose(goal, np.tile([[-3.0, 0, 5], [0, 0, 5], [3, 0, 5]], (300, 1, 1)))
+    state, pad, _ = starts("landing")
+    above = np.asarray(state.pos - pad)[..., 2]
+    assert 0.5 <= above.min() < 0.51 and 1.49 < above.max() <= 1.5
+
+
+def test_a_landing_has_crashed_where_a_drone_is_upside_down_on_the_ground():
+    task = TASKS["landing"](drones=3)
+    drones = jd.State.at_rest(jnp.array([[0, 0, 0.05], [0, 0, 0.05], [0, 0, 1.0]]))
+    drones = drones.replace(quat=jnp.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [1, 0, 0, 0]]))
+    world = SimpleNamespace(params=TEAM, drones=drones)
+    assert task.terminations["crashed"](task, world).tolist() == [False, True, False]
+
+
+def test_who_recovers_is_level_slow_and_near_in_the_end():
+    good = {"upright": np.cos(np.radians(14)), "speed": 0.4, "error": 0.4}
+    bad = {"upright": np.cos(np.radians(16)), "speed": 0.6, "error": 0.6}
+    for change, recovered in ({}, True), *(({name: x}, False) for name, x in bad.items()):
+        metrics = {name: jnp.array([[x]]) for name, x in (good | change).items()}
+        assert TASKS["recovery"]().success(metrics, 0.01).tolist() == [recovered]

@@ -100,6 +100,9 @@ def test_a_hover_of_less_than_two_seconds_is_no_success():
     task, still = TASKS["hover"](), jnp.zeros((200, 1))
     for steps, success in (200, True), (199, False), (50, False):
         assert task.success({"error": still[:steps], "speed": still[:steps]}, 0.01).tolist() == [success]
+    for name in "error", "speed":
+        metrics = {"error": still, "speed": still} | {name: still.at[0].set(0.2)}
+        assert task.success(metrics, 0.01).tolist() == [False]
 
 
 @pytest.mark.parametrize("name", [*HEIGHTS, "fly-through-gate", "tune", "meetup", "gates"])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized, mostly_slow, mostly_slow_rows
 
-from jaxdrones import rotation
+from jaxdrones import load_params, repeat, rotation
 from jaxdrones.envs import make
 from jaxdrones.sensing import Scene
 from jaxdrones.tasks import crossing, shaping
-from jaxdrones.tasks.crowd import FLOOR
+from jaxdrones.tasks.crowd import FLOOR, _random_sides, in_box
 from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
 
 KEYS = jax.random.split(jax.random.key(0), 20)
@@ -33,6 +33,18 @@ def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(dro
         apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9 * np.eye(drones)
         assert apart.min() > 4 * radius
     assert np.linalg.norm(worlds.variables["goal"] - worlds.drones.pos, axis=-1).mean() > 0.4 * side
+
+
+def test_the_largest_of_different_vehicles_sets_the_distance_between_starts():
+    params = repeat(load_params("cf2x"), 2).replace(collision_radius=jnp.array([0.05, 0.3]))
+    places = jit_unoptimized(jax.vmap(lambda key: in_box(key, params, Scene(), np.zeros(3), 3.0, False)[0].pos))(KEYS)
+    assert np.min(np.linalg.norm(places[:, 0] - places[:, 1], axis=-1)) > 4 * 0.3
+
+
+def test_in_half_of_the_random_boxes_one_side_is_up_to_twice_as_long():
+    sides = np.sort(jax.vmap(lambda key: _random_sides(key, 2.0))(jax.random.split(KEYS[0], 1000)), axis=1)
+    assert 1.2 <= sides.min() < 1.21 and sides[:, :2].max() < 2.2 and 3.9 < sides.max() <= 4
+    np.testing.assert_allclose(np.mean(sides[:, 2] > 2.2), 0.9 / 2, atol=0.06)  # 3.8 standard deviations
 
 
 @pytest.mark.slow

@@ -140,11 +140,28 @@ def test_the_centerline_between_gates_on_a_circle_is_nearly_the_circle():
     np.testing.assert_allclose(line.speed[2:], 2.0, rtol=0.03)  # v^2 / r is the largest acceleration
 
 
+def test_the_centerline_of_a_half_turn_is_flatter_than_an_arc():
+    gates = np.array([(0, i, 1, np.pi * (i % 2)) for i in range(1, 5)])
+    line = centerline_of(jnp.asarray(gates), jnp.asarray([0.0, 0, 1, 0]), jnp.asarray(4.0))
+    np.testing.assert_allclose(line.pos[:, 6], [(x, 0.5 + i, 1) for i, x in enumerate((0.25, -0.25) * 2)], atol=1e-12)
+
+
+def test_points_near_a_drone_are_those_about_the_segment_to_its_next_gate():
+    flat = np.asarray(LINE().pos).reshape(-1, 3)
+    for index, first in (0, 0), (1, 8), (7, 72):  # 4 points before it and 8 behind; all others may cross it
+        section = LINE().near(jnp.asarray(index))
+        np.testing.assert_array_equal(section.pos, flat[first : first + 24])
+    np.testing.assert_allclose(jnp.linalg.norm(centerline.tangent(section, jnp.eye(24)[-1])), 1, rtol=1e-9)
+
+
 def test_speeds_of_the_centerline_begin_at_rest_and_use_the_acceleration_up_to_its_limit():
     along, square = np.asarray(LINE().along).ravel(), np.asarray(LINE().speed).ravel() ** 2
     share = np.diff(square) / (2 * 12.0 * np.diff(along))
     assert square[0] == 0
     np.testing.assert_allclose([share.min(), share.max()], [-1, 1])
+    gates = jnp.stack([jnp.array([x, 0, 1, 0]) for x in (1.0, 2, 3, 4)])
+    straight = centerline_of(gates, jnp.array([0.0, 0, 1, 0]), jnp.asarray(12.0))
+    np.testing.assert_allclose(straight.speed**2, 2 * 12.0 * straight.along, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from jaxdrones import load_params, repeat, rotation
 from jaxdrones.envs import make
 from jaxdrones.sensing import Scene
 from jaxdrones.tasks import crossing, shaping
-from jaxdrones.tasks.crowd import FLOOR, _random_sides, in_box
+from jaxdrones.tasks.crowd import FLOOR, _random_sides, crowd, in_box
 from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
 
 KEYS = jax.random.split(jax.random.key(0), 20)
@@ -36,9 +36,25 @@ def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(dro
 
 
 def test_the_largest_of_different_vehicles_sets_the_distance_between_starts():
-    params = repeat(load_params("cf2x"), 2).replace(collision_radius=jnp.array([0.05, 0.3]))
-    places = jit_unoptimized(jax.vmap(lambda key: in_box(key, params, Scene(), np.zeros(3), 3.0, False)[0].pos))(KEYS)
-    assert np.min(np.linalg.norm(places[:, 0] - places[:, 1], axis=-1)) > 4 * 0.3
+    """Where no random place is far enough, as for a drone as wide as the box, it is the farthest."""
+
+    @jit_unoptimized
+    def apart(largest):
+        params = repeat(load_params("cf2x"), 2)
+        params = params.replace(collision_radius=jnp.stack([0.05, largest]))
+        pos = jax.vmap(lambda key: in_box(key, params, Scene(), np.zeros(3), 3.0, False)[0].pos)(KEYS)
+        return jnp.linalg.norm(pos[:, 0] - pos[:, 1], axis=-1)
+
+    for largest in 0.3, 3.0:
+        assert jnp.min(apart(largest)) > 4 * 0.3
+
+
+def test_balls_fill_the_cube_and_the_longest_diagonal_sets_the_duration():
+    spheres = crowd(drones=64, obstacles=2.0).scene(KEYS[0]).spheres
+    away = np.asarray(spheres.pos) - [0, 0, FLOOR + 2]
+    assert away.shape == (128, 3) and np.all(away.min(axis=0) < -1.8) and np.all(away.max(axis=0) > 1.8)
+    assert np.abs(away).max() <= 2 and 0.1 <= spheres.radius.min() < 0.11 and 0.19 < spheres.radius.max() <= 0.2
+    assert crowd(random_box=True).duration == pytest.approx(6 + np.sqrt(4**2 + 2**2 + 2**2) / 1.2)
 
 
 def test_in_half_of_the_random_boxes_one_side_is_up_to_twice_as_long():

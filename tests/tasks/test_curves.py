@@ -24,6 +24,12 @@ def test_drones_that_cross_are_above_each_other_twice_a_period():
         np.testing.assert_allclose(crossing.positions(2, t)[:, 0], 0, atol=1e-12)
 
 
+def test_a_hop_is_to_the_height_and_its_amplitude_about_which_it_oscillates():
+    hop = curves.hop(height=1.0, amplitude=0.2, period=4.0)
+    for t, z in (0.0, 1.2), (1.0, 1.4), (3.0, 1.0):
+        np.testing.assert_allclose(hop.positions(2, t), [[0, 0, z], [1, 0, z]], atol=1e-12)
+
+
 @pytest.mark.parametrize("curve", [curves.circle(), curves.crossing(3), curves.hop()])
 def test_velocity_and_acceleration_are_the_derivatives_of_the_curve(curve):
     h = 1e-4
@@ -41,7 +47,18 @@ def test_shapes_repeat_after_a_period_and_stay_within_their_size(shape):
     s = jnp.linspace(0, 1, 100, endpoint=False)
     along = jax.jit(jax.vmap(shape, (None, 0)))
     np.testing.assert_allclose(along(u, s), along(u, s + 2), atol=1e-12)
-    assert np.all(np.abs(along(u, s)) <= 1 + 1e-12)
+    assert np.all(np.abs(along(u, s)) <= np.array([1, 1, 0.5]) + 1e-12)
+
+
+def test_amplitudes_and_phases_of_a_lissajous_figure_are_drawn_for_themselves():
+    u = np.random.default_rng(0).uniform(-1, 1, curves.RANDOM_NUMBERS)
+    expected = (0.75 + 0.25 * u[:3]) * np.sin(np.pi * u[3:6]) * [1, 1, 0.5]
+    np.testing.assert_allclose(curves.lissajous(jnp.asarray(u), jnp.zeros(())), expected, atol=1e-12)
+
+
+def test_centers_of_curves_are_in_a_row_about_the_origin():
+    center = curves.draw(jax.random.key(0), jax.random.key(1), 3, 4.0, 2.0, float)["center"]
+    np.testing.assert_array_equal(center, [[0, -4, 2], [0, 0, 2], [0, 4, 2]])
 
 
 def test_tracking_follows_the_shape_with_its_derivatives():

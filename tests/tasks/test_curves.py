@@ -56,6 +56,12 @@ def test_amplitudes_and_phases_of_a_lissajous_figure_are_drawn_for_themselves():
     np.testing.assert_allclose(curves.lissajous(jnp.asarray(u), jnp.zeros(())), expected, atol=1e-12)
 
 
+def test_polynomials_pass_all_waypoints_in_order():
+    u = np.random.default_rng(0).uniform(-1, 1, curves.RANDOM_NUMBERS)
+    passed = jax.vmap(curves.polynomial, (None, 0))(jnp.asarray(u), jnp.arange(curves.WAYPOINTS) / curves.WAYPOINTS)
+    np.testing.assert_allclose(passed, u[:24].reshape(8, 3) * [1, 1, 0.5], atol=1e-12)
+
+
 def test_centers_of_curves_are_in_a_row_about_the_origin():
     center = curves.draw(jax.random.key(0), jax.random.key(1), 3, 4.0, 2.0, float)["center"]
     np.testing.assert_array_equal(center, [[0, -4, 2], [0, 0, 2], [0, 4, 2]])

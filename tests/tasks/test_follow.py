@@ -3,10 +3,14 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import jit_unoptimized
+from scipy.spatial.transform import Rotation
 
 from jaxdrones.envs import make
+from jaxdrones.sensing import Scene
 
 ENV = functools.cache(lambda: make("follow", drones=3))
 first_world = functools.cache(lambda: jit_unoptimized(ENV().reset)(jax.random.key(0))[1])
@@ -69,3 +73,42 @@ def test_a_follower_that_passes_through_another_drone_between_two_control_steps_
         before = world.drones.pos + np.array([[0, 0, 0], [0, gap * radius, 0], [0, 0, 0]])
         now = world.replace(drones=world.drones.replace(pos=pos), variables=world.variables | {"pos": before})
         np.testing.assert_array_equal(touched_in(now), [touched, touched, False])
+    pos = np.array([[9.0, 0, 3], [0, 0, 3], [0, 9, 0.5 * radius]])
+    already = world.variables | {"pos": pos, "touched": np.array([False, True, False])}
+    now = world.replace(drones=world.drones.replace(pos=pos), variables=already)
+    assert touched_in(now).tolist() == [False, True, True], "the ground, and what had touched before"
+
+
+def test_a_team_starts_in_a_line_at_its_distance_with_the_motion_of_the_leader_and_in_view():
+    task, params = ENV().task, ENV().params
+
+    @jit_unoptimized
+    @jax.vmap
+    def starts(key):
+        state, variables = task.begin(key, params, Scene())
+        return state, task.target(variables, jnp.zeros(()))
+
+    state, target = starts(jax.random.split(jax.random.key(0), 50))
+    ahead = np.asarray(state.pos[:, :-1] - state.pos[:, 1:])
+    assert np.all(np.abs(np.linalg.norm(ahead, axis=-1) - 1.5) < 0.2 * np.sqrt(3))
+    np.testing.assert_allclose(np.abs(np.mean(ahead, axis=0)), 0, atol=0.6)  # in any direction
+    east = Rotation.from_quat(np.reshape(state.quat[:, 1:], (-1, 4))).apply([1, 0, 0]).reshape(ahead.shape)
+    assert np.min(np.sum(east * ahead, axis=-1)) > 1.2
+    assert np.all(np.abs(state.vel - target.vel[:, :1]) <= 0.1)
+    np.testing.assert_array_equal(target.vel[:, 1:], state.vel[:, :-1])
+    assert np.all(np.any(target.acc[:, 0] != 0, axis=-1)) and not np.any(target.acc[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("error", "unseen", "touched", "success"), [(0.4, 5, 0, 1), (0.5, 5, 0, 0), (0.4, 6, 0, 0), (0.4, 5, 1, 0)]
+)
+def test_success_is_the_distance_on_average_and_the_other_in_view_for_95_percent_after_two_seconds(
+    error, unseen, touched, success
+):
+    k = np.arange(200)[:, None]
+    metrics = {
+        "distance_error": np.where(k < 100, 9.0, error + 0.3 * (-1.0) ** k),
+        "in_view": np.where((k < 100) | (k >= 200 - unseen), 0.0, 1.0),
+        "touched": np.where(k < 199, 0.0, touched),
+    }
+    assert ENV().task.success({name: jnp.asarray(x) for name, x in metrics.items()}, 0.02).tolist() == [bool(success)]

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
-from jaxdrones.envs import make
+from jaxdrones import load_params, repeat
+from jaxdrones.envs import TASKS, make
 from jaxdrones.sensing import Cylinder, Scene, collisions
 
 ENV = functools.cache(lambda: make("forest", vision=()))
@@ -76,7 +78,18 @@ def test_the_path_is_summed_and_progress_is_what_the_goal_comes_closer():
     np.testing.assert_allclose(ENV().task.metrics["detour"](ENV().task, world), 3.0, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("pos", "out"), [((10, 4.9, 1), 0), ((10, -5.1, 1), 1), ((10, 5.1, 1), 1), ((30, 0, 1), 1)])
+@pytest.mark.parametrize(
+    ("pos", "out"),
+    [
+        ((10, 4.9, 1), 0),
+        ((10, -5.1, 1), 1),
+        ((10, 5.1, 1), 1),
+        ((-1.9, 0, 3.9), 0),
+        ((-2.1, 0, 1), 1),
+        ((22.1, 0, 1), 1),
+        ((10, 0, 4.1), 1),
+    ],
+)
 def test_a_drone_that_leaves_the_strip_of_ten_meters_ends_its_episode(pos, out):
     world = first_world()
     drones = world.drones.replace(pos=jnp.array([pos], float))
@@ -138,6 +151,36 @@ def test_traversability_is_the_free_way_in_widths_of_the_drone():
     np.testing.assert_allclose(metric(ENV().task, world.replace(scene=Scene()))[0], 20 / width)
     wall = Scene.of(Cylinder(pos=(60.0, 0.0, 0.0), radius=50.0 - width / 2, height=1.0))  # nearly flat, 10 m ahead
     assert 10 < metric(ENV().task, world.replace(scene=wall))[0] * width < 10.2
+    nothing = wall.replace(cylinders=wall.cylinders.replace(active=jnp.zeros(1, bool)))
+    np.testing.assert_allclose(metric(ENV().task, world.replace(scene=nothing))[0], 20 / width)
+
+
+def test_a_flight_to_the_goal_at_the_commanded_speed_with_the_camera_ahead_costs_nothing():
+    def terms(vel, quat):
+        drones = world.drones.replace(pos=jnp.array([[5.0, 0, 1.5]]), vel=jnp.array([vel]), quat=jnp.array([quat]))
+        now = world.replace(drones=drones, variables=world.variables | {"progress": jnp.array([vel[0] * ENV().dt])})
+        rewards = ENV().task.rewards
+        return [rewards[name][1](ENV().task, now)[0] for name in ("velocity", "progress", "heading", "height")]
+
+    world = first_world()
+    np.testing.assert_allclose(terms([3.0, 0, 0], [0.0, 0, 0, 1]), [0, 1, 0, 0], atol=1e-12)
+    slow = (np.hypot(3, 0.3) - 0.3) / 3
+    np.testing.assert_allclose(terms([0.0, 0, 0], [0.0, 0, 1, 0]), [slow, 0, 2, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("drones", "spread"), [(1, 0.5), (2, 0.3)])
+def test_drones_start_side_by_side_and_all_have_to_reach_the_goals_ahead_of_them(drones, spread):
+    task = TASKS["forest"](drones=drones)
+    params = repeat(load_params("cf2x"), drones)
+    begin = jit_unoptimized(jax.vmap(lambda key: task.begin(key, params, Scene())))
+    state, variables = begin(jax.random.split(jax.random.key(0), 200))
+    y = np.arange(drones) - (drones - 1) / 2
+    goal = np.stack([np.full(drones, 20), y, np.full(drones, 1.5)], axis=-1)
+    np.testing.assert_array_equal(variables["goal"], np.tile(goal, (200, 1, 1)))
+    off = np.abs(np.asarray(state.pos) - goal + [20, 0, 0]).max(axis=(0, 1))
+    assert off[0] == 0 and spread - 0.02 < off[1] <= spread and 0.18 < off[2] <= 0.2
+    one = SimpleNamespace(variables={"reached": jnp.arange(drones) == 0})
+    assert task.terminations["reached"](task, one).tolist() == [drones == 1] * drones
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
+from jaxdrones import load_params, repeat
 from jaxdrones.envs import make
 from jaxdrones.envs.randomize import AnyVehicle
+from jaxdrones.sensing import Scene, Sphere
 from jaxdrones.tasks import centerline
-from jaxdrones.tasks.race import _order
+from jaxdrones.tasks.race import _clearance, _course, _grid, _in_flight, _observe_line, _order, race
 from jaxdrones.tasks.racetrack import GATES, OPENING, direction, passes
 from jaxdrones.tasks.starts import standing_height
 
@@ -36,10 +39,10 @@ def advance(drones=2, **options):
     return jit_unoptimized(lambda world: env.task.advance(env.task, world))
 
 
-def after(before, pos, index=0, active=None, **options):
+def after(before, pos, index=0, active=None, steps=0, known=None, **options):
     """Variables after a step of two drones between these positions."""
-    world = start()
-    variables = world.variables | {"pos": jnp.asarray(before), "index": jnp.full(2, index)}
+    world = start().replace(step=jnp.asarray(steps, jnp.int32))
+    variables = world.variables | {"pos": jnp.asarray(before), "index": jnp.full(2, index)} | (known or {})
     drones = world.drones.replace(pos=jnp.asarray(pos))
     active = world.active if active is None else jnp.asarray(active)
     return advance(**options)(world.replace(drones=drones, variables=variables, active=active))
@@ -80,6 +83,72 @@ def test_drones_that_pass_through_each_other_between_two_control_steps_have_touc
         left, right = [[0.0, 1.5, 1.0], [0.4, 1.5 + aside, 1.0]], [[0.4, 1.5, 1.0], [0.0, 1.5 + aside, 1.0]]
         np.testing.assert_array_equal(after(left, right)["touched"], [touched] * 2)
         np.testing.assert_array_equal(after(left, right, active=[True, False])["touched"], [False] * 2)
+
+
+def test_gates_progress_and_time_are_those_of_drones_that_race():
+    ahead = 0.1 * np.asarray(direction(jnp.asarray(GATES[0])))
+    step = [GATES[0][:3] - ahead, GATES[0][:3] - ahead + 1.0], [GATES[0][:3] + ahead, GATES[0][:3] + ahead + 1.0]
+    for index, active, gates in (0, [True, True], 1), (0, [False, True], 0), (4, [True, True], 4):
+        variables = after(*step, index=index, active=active, steps=120)
+        races = np.array(active) & (index < 4)
+        assert variables["index"][0] == gates and variables["before"][0] == index
+        np.testing.assert_array_equal(variables["progress"] != 0, races)
+        np.testing.assert_allclose(variables["lap_time"], np.where(races, 120 * ENV().dt, 0))
+
+
+def test_what_has_been_touched_and_overtaken_counts_until_the_end():
+    known = {"touched": jnp.array([True, False]), "overtakes": jnp.array([2.0, 1.0])}
+    place = [[0.0, 1.5, 1.0], [1.5, 1.5, 1.0]]
+    variables = after(place, place, known=known)
+    assert variables["touched"].tolist() == [True, False] and variables["overtakes"].tolist() == [2, 1]
+
+
+def test_success_is_all_gates_of_all_laps_without_touching():
+    success = race(laps=2).success
+    metrics = {"gates": jnp.array([[4.0, 8, 8]]), "touched": jnp.array([[0.0, 0, 1]])}
+    assert success(metrics, 0.02).tolist() == [False, True, False]
+
+
+def test_beside_a_straight_centerline_a_policy_is_told_to_fly_along_and_back_to_it():
+    gates = jnp.stack([jnp.array([x, 0, 1, 0]) for x in (2.0, 4, 6, 8)])
+    line = centerline_of(gates, jnp.array([0.0, 0, 1, 0]), jnp.asarray(12.0))
+    drones = SimpleNamespace(pos=jnp.array([[3.0, 0.1, 1.0]]))
+    world = SimpleNamespace(variables={"line": line, "index": jnp.array([1])}, drones=drones)
+    found = jit_unoptimized(lambda: _observe_line(None, world))()[0]
+    np.testing.assert_allclose(found[:3], [np.sqrt(2 * 12 * 3.0), -3 * 0.1, 0], atol=0.05)
+    np.testing.assert_allclose(found[3:].reshape(3, 3), [[x, -0.1, 0] for x in (0.3, 0.7, 1.2)], atol=0.02)
+
+
+def test_the_clearance_of_obstacles_falls_off_beyond_six_centimeters():
+    scene = Scene.of(Sphere(pos=(0.0, 0.0, 0.3), radius=0.1))
+    drones = SimpleNamespace(pos=jnp.array([[0.25, 0, 0.3], [1.25, 0, 0.1]]))
+    world = SimpleNamespace(scene=scene, drones=drones, params=SimpleNamespace(collision_radius=jnp.full(2, 0.06)))
+    np.testing.assert_allclose(_clearance(None, world), [0.03 * np.log1p(np.exp(-1)), 0], atol=1e-9)
+
+
+def test_behind_the_last_gate_the_course_goes_straight_on():
+    course = np.asarray(_course(jnp.asarray(GATES), 2))
+    np.testing.assert_allclose(course[:8], np.tile(GATES, (2, 1)))
+    np.testing.assert_allclose(course[8:], GATES[-1] + [[1.5, 0, 0, 0], [3, 0, 0, 0]])
+
+
+def test_drones_start_in_any_order_on_the_ground_and_in_flight_along_the_centerline():
+    params, line = repeat(load_params("cf2x"), 3), LINE()
+    keys = jax.random.split(jax.random.key(0), 100)
+
+    @jit_unoptimized
+    def starts(keys):
+        flying = jax.vmap(lambda key: _in_flight(key, params, line, 8))(keys)
+        return jax.vmap(lambda key: _grid(key, params, jnp.asarray(START)))(keys), flying
+
+    grid, (flying, index) = starts(keys)
+    y = np.asarray(grid.pos)[..., 1]
+    assert {*np.argmin(y, axis=1)} == {0, 1, 2} and np.all(np.abs(np.diff(np.sort(y, axis=1)) - 0.4) < 0.1)
+    along = np.asarray(jnp.take_along_axis(line.pos[:, 6][None], index[..., None], axis=1) - flying.pos)
+    assert np.max(np.linalg.norm(along, axis=-1)) < 2.5  # in the segment to the next gate
+    tangent = np.asarray(line.pos[:, -1] - line.pos[:, 0])[np.asarray(index)]
+    assert np.mean(np.sum(tangent * np.asarray(flying.vel), axis=-1)) > 1
+    assert {*np.argmax(np.asarray(index), axis=1)} == {0, 1, 2}
 
 
 @pytest.mark.slow

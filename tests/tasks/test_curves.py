@@ -2,7 +2,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
+from jaxdrones import load_params, repeat
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks import curves
 from jaxdrones.tasks.tracking import tracking
 
@@ -84,3 +87,22 @@ def test_nobody_and_no_time_are_refused():
         curves.circle().positions(0)
     with pytest.raises(ValueError, match="period is 0"):
         curves.circle(period=0)
+
+
+@pytest.mark.parametrize("random_start", [True, False])
+def test_tracking_starts_with_the_motion_of_a_random_point_or_at_rest_at_the_start(random_start):
+    task = tracking(drones=2, random_start=random_start)
+    begin = jax.vmap(lambda key: task.begin(key, repeat(load_params("cf2x"), 2), Scene()))
+    state, variables = jit_unoptimized(begin)(jax.random.split(jax.random.key(0), 20))
+    target = jax.vmap(task.target, (0, None))(variables, jnp.zeros(()))
+    spread = 0.1 * random_start
+    assert np.ptp(variables["phase"]) > 0.8 if random_start else not np.any(variables["phase"])
+    assert np.max(np.abs(state.pos - target.pos)) <= spread
+    assert np.max(np.abs(state.vel - random_start * target.vel)) <= spread
+
+
+def test_success_of_tracking_is_the_root_mean_square_after_a_second():
+    k = np.arange(300)[:, None]
+    for larger, success in (0.07, True), (0.072, False):
+        error = np.where(k < 100, 1.0, np.where(k % 2, larger, 0.0))
+        assert tracking().success({"error": jnp.asarray(error)}, 0.01).tolist() == [success]

@@ -1,6 +1,7 @@
 """What counts as passing a gate, what as hitting it, and where a race starts."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
-from jaxdrones import load_params
+from jaxdrones import load_params, repeat
 from jaxdrones.envs import make
 from jaxdrones.sensing import Scene, track
-from jaxdrones.tasks.gates import FRAME, GATES, OPENING, POLES
+from jaxdrones.tasks import racetrack
+from jaxdrones.tasks.gates import FRAME, GATES, OPENING, POLES, gates
+from jaxdrones.tasks.racetrack import direction
 
 ENV = functools.cache(lambda: make("gates"))
 RADIUS = float(load_params("cf2x").collision_radius)
@@ -68,6 +71,11 @@ def test_the_time_penalty_costs_every_step_and_a_crash_sixty_of_them():
         np.testing.assert_allclose(plain - less, penalty, rtol=1e-6)
 
 
+def test_a_frame_between_the_places_of_two_control_steps_is_hit():
+    beside = (OPENING / 2 + FRAME / 2) * LEFT
+    assert moved(in_gate(beside - 5 * THROUGH), in_gate(beside + 5 * THROUGH))["hit"][0]
+
+
 def test_other_gates_than_the_next_one_are_hit_too():
     assert moved(in_gate(-THROUGH, GATES[2]), in_gate((OPENING / 2) * LEFT, GATES[2]))["hit"][0]
 
@@ -99,6 +107,39 @@ def test_poles_are_hit_as_high_as_they_are():
 def test_progress_is_the_distance_gained_on_the_next_gate():
     start, end = in_gate(-10 * THROUGH), in_gate(-3 * THROUGH)
     np.testing.assert_allclose(moved(start, end)["progress"], 0.7, rtol=1e-12)
+
+
+def test_who_starts_in_the_air_starts_before_its_gate():
+    task = gates(drones=2, random_start=True)
+    begin = jax.vmap(lambda key: task.begin(key, repeat(load_params("cf2x"), 2), task.scene))
+    state, variables = jit_unoptimized(begin)(jax.random.split(jax.random.key(0), 100))
+    index = np.asarray(variables["index"])
+    grounded = np.asarray(state.pos)[..., 2] < 0.1
+    assert 0.1 < np.mean(grounded) < 0.3 and {*index[~grounded]} == {0, 1, 2, 3}
+    before = np.sum((GATES[index][..., :3] - state.pos) * direction(jnp.asarray(GATES[index])), axis=-1)[~grounded]
+    assert 0.25 < before.min() and before.max() < 1.15 and abs(before.mean() - 0.7) < 0.05
+
+
+def test_a_team_has_finished_when_all_have_passed_all_gates():
+    finished = gates(drones=2).terminations["finished"]
+    for index, over in ((4, 3), False), ((4, 4), True):
+        assert finished(None, SimpleNamespace(variables={"index": jnp.array(index)})).tolist() == [over] * 2
+
+
+def test_a_random_track_is_counterclockwise_with_a_gate_in_every_quarter():
+    for u in (0.0, 1.0):
+        place = [[1.3, 0], [0, 0.9], [-1.3, 0], [0, -0.9]]
+        expected = [
+            [*xy, 0.95, heading] for xy, heading in zip(place, np.pi * np.array([0.5, 1, -0.5, 0]), strict=True)
+        ]
+        found = racetrack._random_track(jnp.full((4, 4), u))
+        np.testing.assert_allclose(found, np.array(expected) + u * np.array([0.25, 0.25, 0.25, 0.6]), atol=1e-12)
+
+
+def test_every_moment_of_inertia_has_a_random_factor_of_its_own():
+    one = load_params("cf2x")
+    factor = racetrack.randomization_of(1)[0](jax.random.key(0), one).inertia / one.inertia
+    assert len(np.unique(factor)) == 3 and np.all(np.abs(factor - 1) <= 0.2)
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ def test_all_cross_the_axis_at_once_at_their_altitudes(drones):
     slope = np.gradient(np.asarray(target.pos), times, axis=0)
     np.testing.assert_allclose(slope[1:-1], target.vel[1:-1], atol=1e-4)
     directions = np.asarray(target.pos[500, :, :2]) / away[500, :, None]
+    assert np.all(np.abs(world.drones.vel - target.vel[0]) <= 0.05)  # of the first target
     cosines = np.abs(directions @ directions.T) - np.eye(drones)
     assert cosines.max() < 0.99  # no two lines are the same
 
@@ -61,6 +62,11 @@ def test_the_deviation_counts_the_steps_after_the_first_second():
     world.variables = variables | {"squares": squares}
     expected = np.sqrt(np.mean(errors[25:] ** 2, axis=0))
     np.testing.assert_allclose(wake._altitude_deviation(None, world), expected)
+
+
+def test_success_is_every_altitude_after_the_first_second():
+    errors = jnp.zeros((50, 4)).at[24, 1].set(1.0).at[25, 2].set(0.06).at[49, 3].set(0.06)
+    assert wake.wake().success({"altitude_error": errors}, 0.04).tolist() == [True, True, False, False]
 
 
 @pytest.mark.slow

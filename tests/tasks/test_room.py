@@ -85,6 +85,22 @@ def test_the_clearance_begins_with_the_distance_from_the_ground_or_a_wall_howeve
     np.testing.assert_allclose(variables["clearance"], state.pos[:, 2] - params.collision_radius, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "drones", "radius", "height"), [("room", 4, 2.0, 1.5), ("swap-goals", 16, 1.528, 2.0)]
+)
+def test_on_a_ring_nobody_starts_at_the_goal_and_each_goal_is_the_place_of_another(name, drones, radius, height):
+    task = TASKS[name](drones=drones)
+    begin = jax.vmap(lambda key: task.begin(key, repeat(load_params("cf2x"), drones), Scene()))
+    state, variables = jit_unoptimized(begin)(jax.random.split(jax.random.key(0), 50))
+    goal = np.asarray(variables["goal"])
+    np.testing.assert_allclose(np.linalg.norm(goal[..., :2], axis=-1), radius, rtol=1e-3)
+    np.testing.assert_allclose(goal[..., 2], height)
+    away = np.abs(np.asarray(state.pos)[:, :, None] - goal[:, None]).max(axis=-1)
+    own = np.argmin(away, axis=2)
+    assert away.min(axis=2).max() <= 0.1 and np.array_equal(np.sort(own), np.tile(np.arange(drones), (50, 1)))
+    assert not np.any(own == np.arange(drones))
+
+
 def test_a_ring_has_room_for_so_many_drones():
     make("room", drones=12)
     with pytest.raises(ValueError, match="at most 12"):

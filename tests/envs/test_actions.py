@@ -8,7 +8,7 @@ from helpers import VEHICLES, make_step
 
 import jaxdrones
 from jaxdrones import State, assets
-from jaxdrones.control import for_team, pid, velocity
+from jaxdrones.control import Setpoint, for_team, pid, velocity
 from jaxdrones.envs import ACTIONS, make
 
 HZ, SECONDS = 100, 6
@@ -159,3 +159,19 @@ def test_throttle_is_the_share_of_the_largest_speed_whatever_the_vehicle_hovers_
         params = jaxdrones.load_params(vehicle)
         _, speeds = command(params, None, None, jnp.array([-1.0, -0.5, 0.0, 1.0]), None, 0.01)
         np.testing.assert_allclose(speeds / params.max_rpm, [0, 0.25, 0.5, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["thrust_and_torques", "one_d_thrust", "thrust_and_rates", "attitude"])
+def test_the_collective_thrust_of_an_action_is_what_its_description_says(name):
+    action, level = ACTIONS[name](), jax.tree.map(lambda x: x[0], State.at_rest(jnp.zeros((1, 3))))
+    for x, thrust in zip((-1.0, 0.0, 1.0), action.entries(CRAZYFLIE)[0].values, strict=True):
+        _, rpm = action.rpm(CRAZYFLIE, None, level, jnp.zeros(action.size).at[0].set(x), None, 0.01)
+        np.testing.assert_allclose(CRAZYFLIE.kf * jnp.sum(rpm**2), thrust, rtol=1e-9, atol=1e-12)
+
+
+def test_gains_times_one_are_those_of_the_pid():
+    state = jax.tree.map(lambda x: x[0], State.at_rest(jnp.zeros((1, 3))))
+    action, target = ACTIONS["pid_gains"](), Setpoint.at(jnp.array([0.1, -0.1, 0.05]))
+    _, rpm = action.rpm(CRAZYFLIE, pid.init(), state, jnp.zeros(6), target, 0.01)
+    expected = pid.control(pid.gains(), CRAZYFLIE, pid.init(), state, target, dt=0.01)[1]
+    np.testing.assert_array_equal(rpm, expected)

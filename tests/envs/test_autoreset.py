@@ -40,6 +40,7 @@ def test_after_an_end_a_fresh_episode_is_seen_and_the_last_observation_is_kept()
     expected, _, *_ = env.step(KEYS[1 + end], before.world, jnp.zeros((1, 4)))
     np.testing.assert_array_equal(info["final_obs"], expected)
     assert episode.world.step == 0 and not np.allclose(obs, expected)
+    assert not np.allclose(obs, env.reset(KEYS[1 + end])[0]), "the key of the step has been used"
 
 
 def test_parameters_are_constant_unless_something_changes_them():

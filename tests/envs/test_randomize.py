@@ -56,7 +56,6 @@ def test_a_drawn_parameter_is_hidden_from_the_action_type():
     np.testing.assert_allclose(heavy.step(KEY, world, zero)[1].drones.vel, world.drones.vel, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_noise_has_the_standard_deviations_it_is_given():
     state = jd.State.at_rest(jnp.zeros((4000, 3)))
     seen = sensor_noise(pos=0.01, vel=0.02, angle=0.03, omega=0.04)(KEY, state)
@@ -64,6 +63,8 @@ def test_noise_has_the_standard_deviations_it_is_given():
     for x, sigma in (seen.pos, 0.01), (seen.vel, 0.02), (angle, 0.03), (seen.omega, 0.04):
         np.testing.assert_allclose(jnp.std(x, axis=0), sigma, rtol=0.05)
     np.testing.assert_allclose(jnp.sum(seen.quat**2, axis=-1), 1, rtol=1e-12)
+    together = np.corrcoef(np.concatenate([seen.pos, seen.vel, angle, seen.omega], axis=1), rowvar=False)
+    np.testing.assert_allclose(together, np.eye(12), atol=0.08)  # 5 standard deviations
 
 
 @pytest.mark.slow

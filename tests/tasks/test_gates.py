@@ -15,6 +15,7 @@ from jaxdrones.sensing import Scene, track
 from jaxdrones.tasks import racetrack
 from jaxdrones.tasks.gates import FRAME, GATES, OPENING, POLES, gates
 from jaxdrones.tasks.racetrack import direction
+from jaxdrones.tasks.starts import standing_height
 
 ENV = functools.cache(lambda: make("gates"))
 RADIUS = float(load_params("cf2x").collision_radius)
@@ -124,6 +125,13 @@ def test_a_team_has_finished_when_all_have_passed_all_gates():
     finished = gates(drones=2).terminations["finished"]
     for index, over in ((4, 3), False), ((4, 4), True):
         assert finished(None, SimpleNamespace(variables={"index": jnp.array(index)})).tolist() == [over] * 2
+
+
+def test_a_drone_that_stands_has_not_crashed_and_one_below_the_ground_has():
+    params = repeat(load_params("cf2x"), 3)
+    pos = jnp.zeros((3, 3)).at[:, 2].set(standing_height(params) - jnp.array([0, 0.009, 0.011]))
+    world = SimpleNamespace(params=params, drones=SimpleNamespace(pos=pos), variables={"hit": jnp.zeros(3, bool)})
+    assert racetrack.crashed(None, world).tolist() == [False, False, True]
 
 
 def test_a_random_track_is_counterclockwise_with_a_gate_in_every_quarter():

@@ -105,6 +105,10 @@ def test_a_ring_has_room_for_so_many_drones():
     make("room", drones=12)
     with pytest.raises(ValueError, match="at most 12"):
         make("room", drones=13)
+    wide = repeat(load_params("cf2x"), 12)
+    wide = wide.replace(collision_radius=jnp.full(12, 0.4))  # places are 1.04 m apart, starts as little as 0.75 m
+    with pytest.raises(ValueError, match=r"0\.8 m wide and would start in each other, as little as 0\.752 m apart"):
+        TASKS["room"](drones=12).begin(jax.random.key(0), wide, Scene())
 
 
 @pytest.mark.slow

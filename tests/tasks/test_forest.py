@@ -19,9 +19,10 @@ advance = jit_unoptimized(lambda world: ENV().task.advance(ENV().task, world))
 first_world = functools.cache(lambda: jit_unoptimized(ENV().reset)(jax.random.key(0))[1])
 
 
-def moved_to(pos):
+def moved_to(to, **known):
     world = first_world()
-    return advance(world.replace(drones=world.drones.replace(pos=jnp.asarray([pos]))))
+    drones = world.drones.replace(pos=jnp.asarray([to]))
+    return advance(world.replace(drones=drones, variables=world.variables | known))
 
 
 def starts(keys):
@@ -44,7 +45,6 @@ def test_starts_and_goals_are_never_in_an_obstacle():
     assert jnp.min(starts(jax.random.split(jax.random.key(1), 10_000))) > 0.9  # m
 
 
-@pytest.mark.slow
 def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     assert moved_to((19.1, 0, 1.5))["reached"][0] and not moved_to((18.9, 0, 1.5))["reached"][0]
     trees = first_world().scene.cylinders
@@ -53,6 +53,17 @@ def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     beside = beside.at[2].set(1.5)
     assert moved_to(beside + jnp.array([0.01, 0, 0]))["touched"][0]
     assert moved_to((5.0, 0.0, 0.01))["touched"][0]  # the ground
+    assert moved_to((5.0, 0.0, 1.5), touched=jnp.array([True]))["touched"][0], "what has touched has touched"
+    through = jnp.array([trees.radius[i] + 1.0, 0, 0])
+    before = trees.pos[i].at[2].set(1.5) - through
+    assert moved_to(before + 2 * through, pos=before[None])["touched"][0], "a tree on the way"
+
+
+def test_the_clearance_is_the_smallest_so_far():
+    radius = ENV().params.collision_radius[0]
+    for height, clearance in (0.4, 0.4 - radius), (0.8, 0.5):
+        found = moved_to((-5.0, 0.0, height), clearance=jnp.array([0.5]))["clearance"]
+        np.testing.assert_allclose(found, clearance, rtol=1e-12)
 
 
 def test_a_goal_is_rewarded_once_also_while_a_team_waits_for_others():

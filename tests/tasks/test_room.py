@@ -101,6 +101,12 @@ def test_on_a_ring_nobody_starts_at_the_goal_and_each_goal_is_the_place_of_anoth
     assert not np.any(own == np.arange(drones))
 
 
+def test_a_single_drone_flies_to_the_opposite_place():
+    task, params = TASKS["room"](drones=1), repeat(load_params("cf2x"), 1)
+    _, variables = jit_unoptimized(task.begin)(jax.random.key(0), params, Scene())
+    np.testing.assert_allclose(variables["goal"], [[-2, 0, 1.5]])
+
+
 def test_a_ring_has_room_for_so_many_drones():
     make("room", drones=12)
     with pytest.raises(ValueError, match="at most 12"):

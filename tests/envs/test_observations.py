@@ -14,6 +14,8 @@ from scipy.spatial.transform import Rotation
 import jaxdrones as jd
 from jaxdrones.envs import OBSERVATIONS, TASKS, Env, make
 from jaxdrones.envs.observations import deviations
+from jaxdrones.envs.surroundings import encounters, neighbors, obstacles
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks import ObservationTerm, World
 
 TASK = TASKS["hover"](drones=2)
@@ -31,6 +33,43 @@ def test_a_term_in_body_axes_is_the_vector_of_the_world_seen_from_the_drone(name
     goal = {"goal": jnp.array(GOAL)}
     world = World(TEAM, drones, goal, None, jnp.zeros((2, 1, 4)), jnp.zeros(()), jnp.ones(2, bool), 0.01)
     np.testing.assert_allclose(OBSERVATIONS[name].observe(TASK, world), ATTITUDE.inv().apply(world_axes), atol=1e-12)
+
+
+def test_other_terms_are_the_state_of_the_drone_in_their_units():
+    quat = jnp.array(ATTITUDE.as_quat()) * jnp.array([[1.0], [-1.0]])
+    drones = jd.State.at_rest(jnp.zeros((2, 3))).replace(
+        quat=quat, vel=jnp.array(VEL), omega=jnp.array(GOAL), rpm=jnp.full((2, 4), 0.3) * TEAM.max_rpm[:, None]
+    )
+    world = SimpleNamespace(params=TEAM, drones=drones)
+    still = SimpleNamespace(target_now=lambda world: SimpleNamespace(vel=jnp.ones((2, 3))))
+    for name, expected in {
+        "omega_world": ATTITUDE.apply(GOAL),
+        "rotor_speed": np.full((2, 4), 0.3),
+        "velocity_error": 1 - VEL,
+        "quaternion": ATTITUDE.as_quat(canonical=True),
+        "rotation_matrix": ATTITUDE.as_matrix().reshape(2, 9),
+    }.items():
+        np.testing.assert_allclose(OBSERVATIONS[name].observe(still, world), expected, atol=1e-12, err_msg=name)
+
+
+def test_rows_of_drones_and_obstacles_have_the_closest_approach_and_missing_ones_are_far_away():
+    pos, vel = jnp.array([[0.0, 0, 1], [1.0, 0, 1]]), jnp.array([[0.0, 0, -1], [0.0, 0, 0]])
+    world = SimpleNamespace(drones=SimpleNamespace(pos=pos, vel=vel), scene=Scene())
+    seen = jit_unoptimized(lambda: [term.observe(None, world) for term in (encounters(2), obstacles(2), neighbors(2))])
+    others, ground, near = (np.asarray(x) for x in seen())
+
+    def row(x, v, time):
+        away = np.sqrt(x @ x + 0.05**2)
+        return [*x, *v, *(x + time * v), time, *(0.3 / (away * (away + 0.1)) * x)]
+
+    down = np.array([0.0, 0, 1])
+    np.testing.assert_allclose(others[0, :13], row(np.array([1.0, 0, 0]), down, 0))
+    np.testing.assert_allclose(ground[0, :13], row(-down, down, 1 / 1.05), atol=1e-12)
+    np.testing.assert_allclose(ground[1, :13], row(-down, 0 * down, 0), atol=1e-12)
+    np.testing.assert_allclose(
+        near, [[1, 0, 0, 0, 0, 1, 20, 20, 20, 0, 0, 0], [-1, 0, 0, 0, 0, -1, 20, 20, 20, 0, 0, 0]]
+    )
+    assert np.all(np.linalg.norm(others[:, 13:16], axis=1) > 30) and np.all(ground[:, 13] == 20)
 
 
 def test_a_privileged_critic_is_given_relative_deviations_of_what_is_drawn():

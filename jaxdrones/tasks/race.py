@@ -227,7 +227,10 @@ def _desired_velocity(world: World) -> Float[Array, "n 3"]:
 
 
 def _observe_line(task: Task, world: World) -> Float[Array, "n 12"]:
-    """Desired velocity, m/s, and points of the centerline ahead, from the drone, m; world axes."""
+    """Desired velocity, m/s, and points of the centerline ahead, from the drone, m; world axes.
+
+    Points are those of the section near the drone: they are nearer where it ends less than that far ahead.
+    """
 
     def ahead(section: centerline.Centerline, pos: Array) -> Array:
         along = centerline.foot(section, pos) @ section.along

@@ -18,10 +18,10 @@ TEAM = jd.repeat(jd.load_params("cf2x"), 3)
 
 
 def starts(name):
-    """States and goals of 300 teams of three, and their attitudes."""
+    """States and variables of 300 teams of three, and their attitudes."""
     begin = jax.vmap(lambda key: TASKS[name](drones=3).begin(key, TEAM, Scene()))
     state, variables = jit_unoptimized(begin)(jax.random.split(jax.random.key(0), 300))
-    return state, variables["goal"], Rotation.from_quat(np.reshape(state.quat, (-1, 4)))
+    return state, variables, Rotation.from_quat(np.reshape(state.quat, (-1, 4)))
 
 
 def test_the_reward_for_precision_falls_with_distance_and_speed_and_is_steepest_at_rest_at_the_goal():
@@ -77,11 +77,12 @@ def test_a_hover_starts_tilted_about_any_axis_by_up_to_its_tilt():
 
 
 def test_a_recovery_starts_upside_down_and_a_landing_above_its_pad():
-    _, goal, attitude = starts("recovery")
+    _, variables, attitude = starts("recovery")
     assert -0.53 < attitude.as_matrix()[:, 2, 2].max() <= -0.5  # 60 degrees from upside down
-    np.testing.assert_allclose(goal, np.tile([[-3.0, 0, 5], [0, 0, 5], [3, 0, 5]], (300, 1, 1)))
-    state, pad, _ = starts("landing")
-    above = np.asarray(state.pos - pad)[..., 2]
+    np.testing.assert_allclose(variables["goal"], np.tile([[-3.0, 0, 5], [0, 0, 5], [3, 0, 5]], (300, 1, 1)))
+    state, variables, _ = starts("landing")
+    above = np.asarray(state.pos - variables["goal"])[..., 2]
+    np.testing.assert_array_equal(variables["sinking"], -state.vel[..., 2])
     assert 0.5 <= above.min() < 0.51 and 1.49 < above.max() <= 1.5
 
 
@@ -91,6 +92,14 @@ def test_a_landing_has_crashed_where_a_drone_is_upside_down_on_the_ground():
     drones = drones.replace(quat=jnp.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [1, 0, 0, 0]]))
     world = SimpleNamespace(params=TEAM, drones=drones)
     assert task.terminations["crashed"](task, world).tolist() == [False, True, False]
+
+
+def test_a_descent_costs_what_is_faster_than_30_cm_and_half_the_height_per_second():
+    _, descent = TASKS["landing"](drones=3).rewards["descent"]
+    drones = jd.State.at_rest(jnp.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, -0.1]]))
+    drones = drones.replace(vel=jnp.array([[0, 0, -1.0], [0, 0, -0.7], [0, 0, -0.5]]))
+    world = SimpleNamespace(drones=drones, variables={"goal": jnp.zeros((3, 3))})
+    np.testing.assert_allclose(descent(None, world), [0.2, 0, 0.2], atol=1e-12)
 
 
 def test_who_recovers_is_level_slow_and_near_in_the_end():

@@ -7,7 +7,7 @@ import pytest
 from helpers import VEHICLES, make_step
 
 import jaxdrones
-from jaxdrones import State, assets
+from jaxdrones import State, assets, rotation
 from jaxdrones.control import Setpoint, for_team, pid, velocity
 from jaxdrones.envs import ACTIONS, make
 
@@ -175,3 +175,19 @@ def test_gains_times_one_are_those_of_the_pid():
     _, rpm = action.rpm(CRAZYFLIE, pid.init(), state, jnp.zeros(6), target, 0.01)
     expected = pid.control(pid.gains(), CRAZYFLIE, pid.init(), state, target, dt=0.01)[1]
     np.testing.assert_array_equal(rpm, expected)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_attitude_is_turned_to_and_kept(axis):
+    action, limits = ACTIONS["attitude"](), np.radians([60, 60, 180])
+    level = jax.tree.map(lambda x: x[0], State.at_rest(jnp.zeros((1, 3))))
+    asked = jnp.zeros(4).at[1 + axis].set(0.25)
+
+    def torque(state):
+        thrust = CRAZYFLIE.kf * action.rpm(CRAZYFLIE, None, state, asked, None, 0.01)[1] ** 2
+        x, y = CRAZYFLIE.rotor_pos[:, 0], CRAZYFLIE.rotor_pos[:, 1]
+        return jnp.array([thrust @ y, -thrust @ x, thrust @ CRAZYFLIE.rotor_spin])
+
+    assert torque(level)[axis] > 1e-9
+    there = rotation.from_rpy(jnp.asarray(0.25 * limits * (np.arange(3) == axis)))
+    np.testing.assert_allclose(torque(level.replace(quat=there)), 0, atol=1e-12)

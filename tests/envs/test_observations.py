@@ -77,8 +77,10 @@ def test_a_privileged_critic_is_given_relative_deviations_of_what_is_drawn():
     chosen = [x is TEAM.mass for x in jax.tree.leaves(TEAM)]
     np.testing.assert_allclose(deviations(drawn, TEAM, chosen), [[0.1], [-0.2]], rtol=1e-9)
     env = SimpleNamespace(terms=(OBSERVATIONS["position"],), task=None, params=TEAM, _drawn=chosen)
-    world = SimpleNamespace(params=drawn, drones=SimpleNamespace(pos=jnp.zeros((2, 3))))
-    np.testing.assert_allclose(Env.privileged_observation(env, world).params, [[0.1], [-0.2]], rtol=1e-9)
+    world = SimpleNamespace(params=drawn, drones=SimpleNamespace(pos=jnp.array(GOAL)))
+    found = Env.privileged_observation(env, world)
+    np.testing.assert_allclose(found.params, [[0.1], [-0.2]], rtol=1e-9)
+    np.testing.assert_array_equal(found.obs, GOAL)
 
 
 @pytest.mark.parametrize(

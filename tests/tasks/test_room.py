@@ -99,6 +99,7 @@ def test_on_a_ring_nobody_starts_at_the_goal_and_each_goal_is_the_place_of_anoth
     own = np.argmin(away, axis=2)
     assert away.min(axis=2).max() <= 0.1 and np.array_equal(np.sort(own), np.tile(np.arange(drones), (50, 1)))
     assert not np.any(own == np.arange(drones))
+    assert TASKS["swap-goals"](drones=8).duration == pytest.approx(4 + 2 / 1.2)
 
 
 def test_a_single_drone_flies_to_the_opposite_place():

@@ -1,6 +1,7 @@
 """What a success is: each task's criterion can be met by a scripted flight, or the task has none; starts are drawn."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import flax.struct
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import jit_unoptimized
 
-from jaxdrones import load_params, repeat, stack
+from jaxdrones import load_params, repeat, rotation, stack
 from jaxdrones.envs import TASKS, make
 from jaxdrones.learning import evaluate
 from jaxdrones.pytree import PyTreeNode
@@ -138,3 +139,36 @@ def test_drones_of_different_vehicles_start_apart():
     pos = np.asarray(jit_unoptimized(lambda key: above_ground(0.0)(key, params)[1])(KEY))
     apart = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + np.eye(5)
     assert np.min(apart) > 2 * np.max(params.arm)
+
+
+def test_what_teams_of_gym_pybullet_drones_are_charged_for_and_where_they_should_be():
+    starts = jnp.array([[0.0, 0, 0.1], [0.2, 0.2, 0.1], [0.4, 0.4, 0.1]])
+    pos = jnp.array([[0.0, 0, 0.6], [0.2, 0.2, 1.0], [0.4, 0.4, 0.4]])
+    params = SimpleNamespace(collision_radius=jnp.array([0.05, 0.06, 0.07]))
+    world = SimpleNamespace(
+        drones=SimpleNamespace(pos=pos), variables=starts, time=jnp.zeros(()), dt=0.02, params=params
+    )
+    costs = {"leader-follower": [0.01, 0.16 / 3, 0.04 / 3], "flock": [0.16, 0.16, 0.36], "meetup": [0.36, 0, 0.36]}
+    for name, expected in costs.items():
+        task = TASKS[name](drones=3)
+        np.testing.assert_allclose(task.rewards["cost"][1](task, world), expected, atol=1e-12)
+    gap = task.metrics["gap"](task, world)
+    np.testing.assert_allclose(gap[0], np.sqrt(0.36) - 0.12, rtol=1e-9)
+    np.testing.assert_allclose(task.target(starts, 0.0).pos, np.tile([0.2, 0.2, 0.1], (3, 1)))
+    highest = TASKS["multi-hover"](drones=3).target(starts, 0.0).pos
+    np.testing.assert_allclose(highest[:, 2], 0.1 + 1 / np.array([1, 2, 3]))
+
+
+def test_a_drone_of_version_2_is_cut_outside_its_box_above_two_meters_or_tilted_by_more_than_23_degrees():
+    cut = TASKS["hover-2x"](drones=5).truncations
+    pos = jnp.array([[1.6, 0, 1], [0, -1.6, 1], [0, 0, 2.1], [1.4, 1.4, 1.9], [0, 0, 1]])
+    rpy = jnp.array([[0.41, 0, 0], [0, -0.41, 0], [0.39, 0, 0], [0, 0.39, 0], [0, 0, 3.0]])
+    world = SimpleNamespace(drones=SimpleNamespace(pos=pos, quat=jax.vmap(rotation.from_rpy)(rpy)))
+    assert cut["out_of_box"](None, world).tolist() == [True, True, True, False, False]
+    assert cut["tilted"](None, world).tolist() == [True, True, False, False, False]
+
+
+def test_who_takes_off_or_meets_does_so_in_the_end():
+    for name, metric, good, bad in ("takeoff", "height", 1.0, 0.9), ("meetup", "gap", 0.04, 0.06):
+        values = jnp.array([[bad, good], [good, bad]])
+        assert TASKS[name](drones=2).success({metric: values}, 0.02).tolist() == [True, False]

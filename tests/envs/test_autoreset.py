@@ -11,6 +11,7 @@ from helpers import assert_close
 
 from jaxdrones.envs import AutoReset, make
 from jaxdrones.envs.autoreset import Episode
+from jaxdrones.envs.episode import RESET
 from jaxdrones.envs.randomize import scaled
 
 env = make("hover", duration=0.05)
@@ -41,6 +42,19 @@ def test_after_an_end_a_fresh_episode_is_seen_and_the_last_observation_is_kept()
     np.testing.assert_array_equal(info["final_obs"], expected)
     assert episode.world.step == 0 and not np.allclose(obs, expected)
     assert not np.allclose(obs, env.reset(KEYS[1 + end])[0]), "the key of the step has been used"
+
+
+def test_images_of_a_start_draw_from_the_key_of_the_reset():
+    keys = []
+    seeing = SimpleNamespace(
+        begin=env.begin,
+        drones=1,
+        constant_fields=env.constant_fields,
+        vision=True,
+        with_images=lambda method, key, world, ended: keys.append(key) or world,
+    )
+    AutoReset(seeing).renewed(jnp.asarray(True), KEYS[0], *auto.reset(KEYS[1]))
+    assert keys == [jax.random.fold_in(KEYS[0], RESET)]
 
 
 def test_parameters_are_constant_unless_something_changes_them():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from helpers import jit_unoptimized
 import jaxdrones as jd
 from jaxdrones import envs
 from jaxdrones.control import Setpoint
+from jaxdrones.envs import episode
 from jaxdrones.learning import bptt, collect, ppo, shac
 from jaxdrones.learning.batch import batch_of
 from jaxdrones.learning.evaluation import evaluate, wilson_interval
@@ -142,6 +144,14 @@ def test_who_flies_on_after_the_time_limit_can_still_fail(ends):
     assert [bool(x[2]) for x in answers] == [False] * (STEPS + 1) + [ends == "team"]
     assert all(np.all(x[4]["terminated"]) == (k == STEPS + 1) for k, x in enumerate(answers))
     assert [bool(x[3]) for x in answers] == [False] * (STEPS - 1) + [True] * 3
+
+
+def test_drones_that_left_are_far_from_the_others_and_from_each_other():
+    env = SimpleNamespace(physics=SimpleNamespace(init=lambda params, state: state))
+    active, drones = jnp.array([False, True, False]), jd.State.at_rest(jnp.ones((3, 3)))
+    pos = episode._without_ended(env, SimpleNamespace(active=active, drones=drones, params=None)).pos
+    apart = np.linalg.norm(pos[:, None] - pos[None], axis=-1)
+    assert pos[1].tolist() == [1, 1, 1] and apart[0, 2] >= 100 and np.all(apart[1, ::2] > 1e4)
 
 
 @pytest.mark.slow

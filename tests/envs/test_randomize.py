@@ -92,6 +92,7 @@ def test_every_episode_draws_a_delay_of_its_own_and_flies_with_it():
     """The share of the newest action says how late it is: 1 without delay, 0.25 of 0.75 control steps."""
     env = make("hover", drones=2, delay=(0.0, 0.01))
     assert env.privileged_size == 1
+    np.testing.assert_allclose(env.params.aux["delay"], 0.5)  # control steps, the mean
 
     @jit_unoptimized
     @jax.vmap

@@ -50,6 +50,8 @@ def test_other_terms_are_the_state_of_the_drone_in_their_units():
         "rotation_matrix": ATTITUDE.as_matrix().reshape(2, 9),
     }.items():
         np.testing.assert_allclose(OBSERVATIONS[name].observe(still, world), expected, atol=1e-12, err_msg=name)
+    normalized = OBSERVATIONS["normalized_kinematics"].observe(still, world)
+    np.testing.assert_allclose(normalized[:, 6:9], VEL / 3, atol=1e-12)
 
 
 def test_rows_of_drones_and_obstacles_have_the_closest_approach_and_missing_ones_are_far_away():

@@ -251,7 +251,8 @@ def test_in_half_of_the_trainings_of_swap_goals_drones_start_in_a_box():
     assert 0.35 < np.mean(on_ring) < 0.65
     np.testing.assert_allclose(goal[on_ring][..., 2], 2.0, rtol=1e-6)
     assert np.all(np.abs(pos[on_ring] - np.array([0, 0, 2])).max(axis=(1, 2)) < 1.2)
-    assert np.min(np.ptp(pos[~on_ring], axis=1).min(axis=1)) > 0.3, "a box, not a ring"
+    extent = np.ptp(pos[~on_ring], axis=1)
+    assert extent.min() > 0.3 and extent.max() < 2 * (8 / 1.5) ** (1 / 3), "a box, not a ring"
     for places in (pos, goal):
         apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9 * np.eye(8)
         assert apart.min() > 4 * float(env.params.collision_radius[0])

@@ -88,7 +88,7 @@ def test_a_gate_counts_in_its_direction_and_in_its_turn():
 
 
 def test_after_the_last_gate_nothing_counts():
-    after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(THROUGH, GATES[-1]), index=len(GATES))
+    after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(0.5 * THROUGH, GATES[-1]), index=len(GATES))
     assert after["index"][0] == len(GATES) and after["progress"][0] == 0
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Count, checked, function
+from jaxdrones.arguments import Count, checked, function, number, shape
 from jaxdrones.control import Setpoint, attitude, for_team, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
@@ -23,6 +23,10 @@ Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Floa
 Entries = tuple[Quantity, ...]
 _ROTORS = [f"speed of rotor {i}" for i in range(4)]
 _AHEAD = "way from the drone to the setpoint"
+_Share = Annotated[float, number(above=0, at_most=1)]
+_Length = Annotated[float, number("m", above=0)]
+_Tilt = Annotated[float, number("degrees", above=0, at_most=180)]
+_Rates = Annotated[tuple[float, float, float], shape(3, meaning="roll, pitch and yaw, rad/s", finite=True)]
 
 
 @checked
@@ -54,7 +58,8 @@ class Action:
         return self if self.for_vehicle is None else dataclasses.replace(self.for_vehicle(params), name=self.name)
 
 
-def rpm(near_hover: float | None = None) -> Action:
+@checked
+def rpm(near_hover: _Share | None = None) -> Action:
     """Four rotor speeds: -1 is standstill, 0 hover speed, 1 full speed; or hover speed times 1 +- `near_hover`."""
     return _rotor_speeds(_ROTORS, functools.partial(_rotor_speed, near_hover=near_hover))
 
@@ -64,7 +69,8 @@ def throttle() -> Action:
     return _rotor_speeds(_ROTORS, lambda params, action: (action + 1) / 2 * params.max_rpm)
 
 
-def one_d_rpm(near_hover: float | None = 0.05) -> Action:
+@checked
+def one_d_rpm(near_hover: _Share | None = 0.05) -> Action:
     """One speed for all rotors; the default range of 5 % about hover is that of gym-pybullet-drones (2021)."""
     return _rotor_speeds(["speed of all rotors"], functools.partial(_rotor_speed, near_hover=near_hover))
 
@@ -79,7 +85,8 @@ def _rotor_speeds(names: list[str], speed: Callable[[Params, Array], Array]) -> 
     return Action(len(names), command, entries=entries)
 
 
-def thrust_and_torques(torque_share: float = 0.05) -> Action:
+@checked
+def thrust_and_torques(torque_share: _Share = 0.05) -> Action:
     """Collective thrust from zero to twice the weight, and torques up to a fraction of the largest.
 
     As in gym-pybullet-drones (2021), they are allocated to rotors without an upper limit, and then limited.
@@ -99,7 +106,8 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
     return Action(4, command, entries=entries)
 
 
-def one_d_thrust(share: float = 0.05) -> Action:
+@checked
+def one_d_thrust(share: _Share = 0.05) -> Action:
     """Collective thrust, the weight times 1 +- `share`."""
 
     def command(params, memory, state, action, setpoint, dt):
@@ -137,25 +145,26 @@ def one_d_velocity() -> Action:
     return _setpoint(1, target, entries)
 
 
-def position(step: float = 0.1) -> Action:
+@checked
+def position(step: _Length = 0.1) -> Action:
     """A position up to `step` (m) away along each axis."""
-
-    def target(params, state, action):
-        return Setpoint.at(state.pos + step * action)
-
-    return _setpoint(3, target, lambda params: quantities(_AHEAD, "m", "world", values=(-step, 0.0, step)))
+    entries = quantities(_AHEAD, "m", "world", values=(-step, 0.0, step))
+    return _setpoint(3, lambda params, state, action: Setpoint.at(state.pos + step * action), lambda params: entries)
 
 
-def one_d_position(step: float = 0.1) -> Action:
+@checked
+def one_d_position(step: _Length = 0.1) -> Action:
     """A position up to `step` (m) above or below."""
+    entries = quantities(_AHEAD, "m", "world", "z", (-step, 0.0, step))
 
     def target(params, state, action):
-        return Setpoint.at(state.pos + jnp.stack([0 * action[0], 0 * action[0], step * action[0]]))
+        return Setpoint.at(state.pos + vector.along_z(step * action[0]))
 
-    return _setpoint(1, target, lambda params: quantities(_AHEAD, "m", "world", "z", (-step, 0.0, step)))
+    return _setpoint(1, target, lambda params: entries)
 
 
-def destination(max_step: float = 1.0) -> Action:
+@checked
+def destination(max_step: _Length = 1.0) -> Action:
     """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
     The setpoint is on the line to it, at most `max_step` (m) ahead. With a delay, a drone first keeps its place.
@@ -166,9 +175,8 @@ def destination(max_step: float = 1.0) -> Action:
         distance = jnp.maximum(vector.dot(away, vector.unit(away)), max_step)
         return Setpoint.at(state.pos + away * max_step / distance)
 
-    return _setpoint(
-        3, target, lambda params: quantities("destination", "m", "world"), lambda state: jnp.clip(state.pos, -1, 1)
-    )
+    entries = quantities("destination", "m", "world")
+    return _setpoint(3, target, lambda params: entries, lambda state: jnp.clip(state.pos, -1, 1))
 
 
 def pid_gains() -> Action:
@@ -194,7 +202,8 @@ def pid_gains() -> Action:
     return Action(6, command, pid.init, for_vehicle, entries)
 
 
-def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
+@checked
+def thrust_and_rates(max_rate: _Rates = (10.0, 10.0, 5.0)) -> Action:
     """Collective thrust (-1 none, 0 the weight, 1 the largest) and body rates up to `max_rate` (rad/s)."""
 
     def command(params, memory, state, action, setpoint, dt):
@@ -207,7 +216,8 @@ def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -
     return Action(4, command, entries=entries)
 
 
-def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
+@checked
+def attitude_and_thrust(max_tilt: _Tilt = 60.0) -> Action:
     """Collective thrust as above, roll and pitch up to `max_tilt` (degrees), yaw up to half a turn."""
 
     def command(params, memory, state, action, setpoint, dt):
@@ -219,9 +229,8 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
 
     def entries(params: Params) -> Entries:
         angles = (("roll", max_tilt), ("pitch", max_tilt), ("yaw", 180.0))
-        return _thrust(0.0, params.weight, params.max_thrust) + tuple(
-            Quantity(angle, "degrees", "body to world", (-limit, 0.0, limit)) for angle, limit in angles
-        )
+        turns = [Quantity(angle, "degrees", "body to world", (-limit, 0.0, limit)) for angle, limit in angles]
+        return (*_thrust(0.0, params.weight, params.max_thrust), *turns)
 
     return Action(4, command, entries=entries)
 
@@ -283,18 +292,9 @@ def _from_hover(action: Array, hover: Array, highest: Array) -> Array:
     return hover + action * jnp.where(action > 0, highest - hover, hover)
 
 
-ACTIONS: dict[str, Callable[..., Action]] = {
-    "rpm": rpm,
-    "throttle": throttle,
-    "one_d_rpm": one_d_rpm,
-    "thrust_and_torques": thrust_and_torques,
-    "one_d_thrust": one_d_thrust,
-    "velocity": velocity_input,
-    "one_d_velocity": one_d_velocity,
-    "position": position,
-    "one_d_position": one_d_position,
-    "destination": destination,
-    "pid_gains": pid_gains,
-    "thrust_and_rates": thrust_and_rates,
-    "attitude": attitude_and_thrust,
-}
+_NAMED_AS_THEIR_FUNCTION = (
+    *(rpm, throttle, one_d_rpm, thrust_and_torques, one_d_thrust, one_d_velocity, position, one_d_position),
+    *(destination, pid_gains, thrust_and_rates),
+)
+ACTIONS: dict[str, Callable[..., Action]] = {function.__name__: function for function in _NAMED_AS_THEIR_FUNCTION}
+ACTIONS |= {"velocity": velocity_input, "attitude": attitude_and_thrust}

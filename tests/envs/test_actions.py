@@ -177,6 +177,25 @@ def test_gains_times_one_are_those_of_the_pid():
     np.testing.assert_array_equal(rpm, expected)
 
 
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *[("rpm", {"near_hover": x}) for x in (0, -0.1, 2.0, np.nan)],
+        ("one_d_rpm", {"near_hover": 1.1}),
+        ("thrust_and_torques", {"torque_share": -1.0}),
+        ("one_d_thrust", {"share": 2.0}),
+        ("position", {"step": -0.1}),
+        ("one_d_position", {"step": np.inf}),
+        ("destination", {"max_step": 0.0}),
+        ("thrust_and_rates", {"max_rate": (1.0, 2.0)}),
+        *[("attitude", {"max_tilt": x}) for x in (-60, 181)],
+    ],
+)
+def test_limits_of_actions_are_refused_where_they_make_no_sense(name, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ACTIONS[name](**options)
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_an_attitude_is_turned_to_and_kept(axis):
     action, limits = ACTIONS["attitude"](), np.radians([60, 60, 180])

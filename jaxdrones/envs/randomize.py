@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
-from jaxdrones.arguments import checked, choice, number
+from jaxdrones.arguments import checked, choice, number, shape
 from jaxdrones.checks import NOT_NEGATIVE, POSITIVE, check_number, is_concrete, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -46,7 +46,8 @@ def scaled(field: Field, low: float, high: float) -> Randomization:
     return _scaled(field, low, high)
 
 
-def _scaled(field: str, low: float, high: float, zero: bool = False) -> Randomization:
+@checked
+def _scaled(field: Field, low: float, high: float, zero: bool = False) -> Randomization:
     """`scaled`; `zero` allows a coefficient that is zero, as another randomization may set wind and force."""
     limit = {"above": 0} if field in POSITIVE else {"at_least": 0} if field in NOT_NEGATIVE else {}
     _check_range(field, low, high, **limit)
@@ -250,6 +251,7 @@ def delayed(actions: Array, steps: float | Array) -> Array:
     return sum((share[:, i, None] * actions[:, i] for i in ages), jnp.zeros((), actions.dtype))
 
 
+_BOUNDS = shape(2, meaning="lower and upper bound")
 _RANGES = {
     "mass": (0.9, 1.1),
     "inertia": (0.8, 1.2),
@@ -263,7 +265,8 @@ _RANGES = {
 _LAGS = "rotor_rise_time", "rotor_fall_time"
 
 
-def realistic_randomization(**ranges: tuple[float, float]) -> tuple[Randomization, ...]:
+@checked
+def realistic_randomization(**ranges: Annotated[tuple[float, float], _BOUNDS]) -> tuple[Randomization, ...]:
     """`REALISTIC_RANDOMIZATION` with other ranges of some parameters: name=(low, high), relative to nominal values.
 
     A coefficient that is zero stays zero.

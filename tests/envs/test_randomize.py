@@ -16,6 +16,7 @@ from jaxdrones.envs.randomize import (
     delayed,
     draw,
     drawn_leaves,
+    realistic_randomization,
     scaled,
     sensor_noise,
     shifted,
@@ -212,6 +213,10 @@ def test_a_push_accelerates_as_newton_says():
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="unknown parameter 'mas'; did you mean 'mass'"):
         scaled("mas", 0.9, 1.1)
+    with pytest.raises(ValueError, match="unknown parameter 'mas'; did you mean 'mass'"):
+        realistic_randomization(mas=(0.9, 1.1))
+    with pytest.raises(ValueError, match=r"mass has shape .*lower and upper bound"):
+        realistic_randomization(mass=0.9)
     with pytest.raises(ValueError, match=r"the range of mass is \(1.1, 0.9\); give the lower bound first"):
         scaled("mass", 1.1, 0.9)
     for randomization in scaled, shifted:

@@ -109,7 +109,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("crowd", "bptt"): _CROSSING | dict(updates=900),
     ("crowd", "ppo"): _CROSSING_PPO,
     ("swap-goals", "bptt"): _CROSSING,
-    ("swap-goals", "ppo"): _CROSSING_PPO | dict(updates=300, critic_learning_rate=3e-3),
+    ("swap-goals", "ppo"): _CROSSING_PPO | dict(updates=300, worlds=128, critic_learning_rate=3e-3),
     ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64, gradient_decay=0.94, learning_rate=3e-3),
     ("race", "bptt"): _RACE,
     ("race", "league"): _RACE,

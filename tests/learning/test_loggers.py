@@ -24,6 +24,9 @@ def test_each_seed_is_a_run_of_wandb(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.chdir(tmp_path)
     log_two_seeds("wandb")
+    import wandb
+
+    wandb.teardown()  # ends the process that writes the files, which may still do so when a run has finished
     runs = [file.read_bytes() for file in tmp_path.glob("wandb/offline-run-*/*.wandb")]
     assert len(runs) == 2
     for name, rewards in REWARDS.items():

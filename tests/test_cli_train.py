@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -57,6 +58,15 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert report == json.loads((folder / "report.json").read_text())
     assert report["evaluation"]["episodes"] == 8 and report["evaluation"]["success"] is None  # too short to succeed
     assert report["seconds"]["training"] > 0 and report["seconds"]["compiling"] > 0
+
+
+def test_the_learning_curve_says_what_was_trained(monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(train_output.learning_curves, "save_curves", lambda *arguments: drawn.append(arguments))
+    recipe = SimpleNamespace(task="hover", algorithm="ppo", realistic=True, options={"vehicle": "racer"})
+    run = SimpleNamespace(recipe=lambda: recipe, history=list, sidecar=dict, sidecar_entry=lambda *_: 7)
+    train_output.draw_curves(SimpleNamespace(no_figure=False), {0: run}, tmp_path)
+    assert drawn[0][2] == "training hover by ppo, realistic, vehicle racer" and drawn[0][4] == {"seed 0": 7}
 
 
 @pytest.mark.slow

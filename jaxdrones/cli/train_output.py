@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import bar, print_warning
-from jaxdrones.cli.report import evaluation_table, percent, success
+from jaxdrones.cli.report import described, evaluation_table, percent, success
 from jaxdrones.cli.train_request import Request
 from jaxdrones.envs.explanation import aligned
 from jaxdrones.learning.evaluation import score_of, wilson_interval
@@ -142,7 +142,7 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
     kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
     episodes = next(iter(runs.values())).sidecar().get("distinct_episodes", 1)
-    title = f"training {recipe.task} by {recipe.algorithm}"
+    title = f"training {described(recipe)}"
     interval = (lambda success: wilson_interval(success * episodes, episodes)) if episodes > 1 else None
     learning_curves.save_curves(histories, folder / "curve.png", title, interval, kept)
     return [folder / "curve.png"]

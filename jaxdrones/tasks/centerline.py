@@ -75,6 +75,18 @@ def at(section: Centerline, along: Float[Array, ""]) -> Float[Array, " p"]:
     return jax.nn.softmax(-((section.along - along) ** 2) / (2 * _WIDTH**2))
 
 
+def interpolate(
+    line: Centerline, along: Float[Array, " n"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]:
+    """Positions (m), unit tangents and speeds (m/s) at coordinates along the curve, m, linear between its points."""
+    pos, coordinate, speed = line.pos.reshape(-1, 3), line.along.reshape(-1), line.speed.reshape(-1)
+    k = jnp.clip(jnp.searchsorted(coordinate, along, side="right"), 1, len(coordinate) - 1)
+    step = coordinate[k] - coordinate[k - 1]
+    share, ways = (along - coordinate[k - 1]) / step, pos[k] - pos[k - 1]
+    speeds = (1 - share) * speed[k - 1] + share * speed[k]
+    return pos[k - 1] + share[:, None] * ways, ways / step[:, None], speeds
+
+
 def tangent(section: Centerline, weights: Float[Array, " p"]) -> Float[Array, "3"]:
     """Unit tangent at the mean of weighted points of a section."""
     ahead = section.pos[1:] - section.pos[:-1]

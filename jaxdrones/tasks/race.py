@@ -16,7 +16,7 @@ from jaxdrones.tasks import centerline, crossing, racetrack, shaping
 from jaxdrones.tasks.pairs import nearest_on_the_way
 from jaxdrones.tasks.racetrack import ARENA, GATES, MIDDLE, OPENING, START
 from jaxdrones.tasks.starts import check_apart, hovering, standing_height, thrown
-from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World
 from jaxdrones.tasks.touching import touches
 
 _GRID, _SPREAD = 0.4, 0.05  # m between starts along y, and half width of random displacements
@@ -26,9 +26,10 @@ _FINISH = 1.5  # m, between the last gate and the points behind it
 _WIDE = 1.0  # m, edge of the opening that counts without contact
 _FAR = 100.0  # m, between drones that left the race
 _MARGIN, _SOFTNESS = 0.06, 0.03  # m: gap to an obstacle below which the reward falls
-_FLYING = 0.8  # share of the random starts in flight
-_BEHIND = 0.1, 0.3  # share of a segment between drones that start in flight
-_MIN_SPEED, _RETURN = 0.5, 3.0  # m/s, and 1/s: of the desired velocity
+_FLYING = 0.5  # share of the random starts in flight
+_FIRST = 1.0  # m along the track: the first of the random starts in flight
+_BETWEEN = 0.35, 2.0  # m along the track between drones that start in flight: in sight of each other or not
+_MIN_SPEED, _RETURN = 1.5, 3.0  # m/s, and 1/s: of the desired velocity
 _PREVIEW = (0.3, 0.7, 1.2)  # m, of the observed points of the centerline
 _LINE_ENTRIES = (
     *quantities("desired velocity along the centerline", "m/s", "world"),
@@ -59,8 +60,8 @@ def race(
         level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles. The policy
             does not observe the poles.
         laps: number of laps of four gates, at most 100.
-        random_start: for training: start in flight at a random place of the track with probability 0.8, one behind
-            the other, else on the ground at the start.
+        random_start: for training: each drone starts in flight with probability 0.5, all of them one behind the other
+            near a random place of the track, else on the ground at the start.
         contact: whether there are contact forces of ground and drones, gates and poles end a race, and only flights
             through the opening of a gate count. Training disables it: fewer physics steps, and longer episodes.
         acceleration: largest acceleration of the observed desired velocity, along the centerline and across it, m/s^2.
@@ -81,8 +82,9 @@ def race(
         state, index = _grid(grid_key, params, origin), jnp.zeros(n, jnp.int32)
         if random_start:
             flying, place = _in_flight(flight_key, params, line, total)
-            flies = jax.random.bernoulli(flying_key, _FLYING)
-            state, index = jax.tree.map(lambda x, y: jnp.where(flies, x, y), (flying, place), (state, index))
+            flies = jax.random.bernoulli(flying_key, _FLYING, (n,))
+            state = jax.tree.map(lambda x, y: jnp.where(flies[:, None], x, y), flying, state)
+            index = jnp.where(flies, place, index)
         zero = jnp.zeros(n, dtype)
         return state, {
             "gates": course,
@@ -183,18 +185,16 @@ def _in_flight(key: jax.Array, params: Params, line: centerline.Centerline, tota
     """One behind the other near a random place of the centerline, in random order; and the next gate of each."""
     place_key, gap_key, order_key, speed_key, throw_key = jax.random.split(key, 5)
     n, dtype = len(params.mass), line.along.dtype
-    gaps = jax.random.uniform(gap_key, (n,), dtype, *_BEHIND)
-    behind = jnp.cumsum(gaps)[jax.random.permutation(order_key, n)]
-    place = jnp.maximum(jax.random.uniform(place_key, (), dtype, 0, total) - behind, 0.5 - 0.1 * behind)
-    index = place.astype(jnp.int32)
-    points = line.pos[index]
-    share = (place - index) * (points.shape[1] - 1)
-    k = jnp.minimum(share.astype(jnp.int32), points.shape[1] - 2)
-    a, b = (jnp.take_along_axis(points, (k + i)[:, None, None], axis=1)[:, 0] for i in (0, 1))
-    share_of_speed = jax.random.uniform(speed_key, (n, 1), dtype)
-    speed = share_of_speed * jnp.take_along_axis(line.speed[index], k[:, None], axis=1)
-    state = thrown(throw_key, params, a + (share - k)[:, None] * (b - a), reach=0.08, speed=0.5, omega=1.0, tilt=0.4)
-    return state.replace(vel=state.vel + speed * (b - a) / norm(b - a)[:, None]), index
+    gaps = jax.random.uniform(gap_key, (n,), dtype, *_BETWEEN).at[0].set(0)
+    ahead = jnp.cumsum(gaps)
+    room = jnp.maximum(line.along[total, 0] - _FIRST - ahead[-1], 0)  # of the last drone, before the last gate
+    last = _FIRST + room * jax.random.uniform(place_key, (), dtype)
+    place = last + ahead[jax.random.permutation(order_key, n)]
+    pos, tangent, fastest = centerline.interpolate(line, place)
+    speed = fastest * jax.random.uniform(speed_key, (n,), dtype)
+    state = thrown(throw_key, params, pos, reach=0.08, speed=0.5, omega=1.0, tilt=0.4)
+    index = jnp.searchsorted(line.along[1:, 0], place, side="right")
+    return state.replace(vel=state.vel + speed[:, None] * tangent), index.astype(jnp.int32)
 
 
 def _course(gates: Float[Array, "g 4"], laps: int) -> Float[Array, "p 4"]:
@@ -264,7 +264,11 @@ def _order(lead: Array, along: Float[Array, " n"], racing: Bool[Array, " n"]) ->
 
 
 def _clearance(task: Task, world: World) -> Float[Array, " n"]:
-    """Smoothed penetration of a margin of 6 cm about gates and poles, m."""
+    """Smoothed penetration of a margin of 6 cm about gates and poles, and of the ground by a drone's feet, m.
+
+    Without the second, a policy that is trained without contact begins to turn before it has left the ground.
+    """
     obstacles = world.scene.replace(ground=False)
-    gap = jax.vmap(obstacles.distance)(world.drones.pos) - world.params.collision_radius
-    return _SOFTNESS * jax.nn.softplus((_MARGIN - gap) / _SOFTNESS)
+    gap = jax.vmap(obstacles.distance)(world.drones.pos) - world.params.collision_radius - _MARGIN
+    height = world.drones.pos[:, 2] - standing_height(world.params)
+    return _SOFTNESS * (jax.nn.softplus(-gap / _SOFTNESS) + jax.nn.softplus(-height / _SOFTNESS))

@@ -117,13 +117,17 @@ def test_beside_a_straight_centerline_a_policy_is_told_to_fly_along_and_back_to_
     found = jit_unoptimized(lambda: _observe_line(None, world))()[0]
     np.testing.assert_allclose(found[:3], [np.sqrt(2 * 12 * 3.0), -3 * 0.1, 0], atol=0.05)
     np.testing.assert_allclose(found[3:].reshape(3, 3), [[x, -0.1, 0] for x in (0.3, 0.7, 1.2)], atol=0.02)
+    drones.pos, world.variables["index"] = jnp.array([[0.0, 0, 1.0]]), jnp.array([0])
+    assert np.linalg.norm(_observe_line(None, world)[0, :3]) >= 1.5  # at the start, where the speed is zero
 
 
-def test_the_clearance_of_obstacles_falls_off_beyond_six_centimeters():
-    scene = Scene.of(Sphere(pos=(0.0, 0.0, 0.3), radius=0.1))
-    drones = SimpleNamespace(pos=jnp.array([[0.25, 0, 0.3], [1.25, 0, 0.1]]))
-    world = SimpleNamespace(scene=scene, drones=drones, params=SimpleNamespace(collision_radius=jnp.full(2, 0.06)))
-    np.testing.assert_allclose(_clearance(None, world), [0.03 * np.log1p(np.exp(-1)), 0], atol=1e-9)
+def test_the_clearance_falls_off_beyond_six_centimeters_of_obstacles_and_above_where_a_drone_stands():
+    scene, params = Scene.of(Sphere(pos=(0.0, 0.0, 1.0), radius=0.1)), repeat(load_params("cf2x"), 4)
+    foot = standing_height(params)[0]
+    pos = jnp.array([[0.25, 0, 1.0], [1.25, 0, 1.0], [1, 0, foot], [1, 0, foot - 0.06]])
+    world = SimpleNamespace(scene=scene, drones=SimpleNamespace(pos=pos), params=params)
+    expected = [0.03 * np.log1p(np.exp(-1)), 0, 0.03 * np.log(2), 0.03 * np.log1p(np.exp(2))]
+    np.testing.assert_allclose(_clearance(None, world), expected, atol=1e-9)
 
 
 def test_behind_the_last_gate_the_course_goes_straight_on():
@@ -138,17 +142,33 @@ def test_drones_start_in_any_order_on_the_ground_and_in_flight_along_the_centerl
 
     @jit_unoptimized
     def starts(keys):
-        flying = jax.vmap(lambda key: _in_flight(key, params, line, 8))(keys)
+        flying = jax.vmap(lambda key: _in_flight(key, params, line, 6))(keys)
         return jax.vmap(lambda key: _grid(key, params, jnp.asarray(START)))(keys), flying
 
     grid, (flying, index) = starts(keys)
     y = np.asarray(grid.pos)[..., 1]
     assert {*np.argmin(y, axis=1)} == {0, 1, 2} and np.all(np.abs(np.diff(np.sort(y, axis=1)) - 0.4) < 0.1)
-    along = np.asarray(jnp.take_along_axis(line.pos[:, 6][None], index[..., None], axis=1) - flying.pos)
-    assert np.max(np.linalg.norm(along, axis=-1)) < 2.5  # in the segment to the next gate
-    tangent = np.asarray(line.pos[:, -1] - line.pos[:, 0])[np.asarray(index)]
-    assert np.mean(np.sum(tangent * np.asarray(flying.vel), axis=-1)) > 1
+    away = np.linalg.norm(flying.pos[:, :, None, None] - line.pos[None, None], axis=-1)
+    place = np.argmin(away.reshape(100, 3, -1), axis=-1)
+    assert np.mean(place // 12 == index) > 0.8 and index.min() == 0 and index.max() == 5
+    way = np.diff(np.asarray(line.pos).reshape(-1, 3), axis=0)[np.minimum(place, 94)]
+    assert np.mean(np.sum(way * np.asarray(flying.vel), axis=-1) > 0) > 0.9
     assert {*np.argmax(np.asarray(index), axis=1)} == {0, 1, 2}
+    apart = np.linalg.norm(flying.pos[:, [0, 0, 1]] - flying.pos[:, [1, 2, 2]], axis=-1)
+    assert apart.min() > 2 * params.collision_radius[0] and 0.1 < np.mean(apart < 1.2) < 0.9  # in sight or not
+
+
+def test_between_its_points_the_centerline_is_straight():
+    line = LINE()
+    pos, along, speed = (np.asarray(x).reshape(96, -1) for x in (line.pos, line.along, line.speed))
+    k, share = np.array([0, 11, 12, 94]), np.array([0.0, 0.25, 0.5, 1.0])
+    place = along[k, 0] + share * (along[k + 1, 0] - along[k, 0])
+    found = centerline.interpolate(line, jnp.asarray(place))
+    for x, y in zip(found, (pos, along, speed), strict=True):
+        expected = y[k] + share[:, None] * (y[k + 1] - y[k])
+        if y is along:  # in its place is the tangent
+            expected = (pos[k + 1] - pos[k]) / (along[k + 1] - along[k])
+        np.testing.assert_allclose(np.reshape(x, expected.shape), expected, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -246,17 +266,19 @@ def test_without_contact_a_gate_counts_also_beside_its_opening_and_its_frame_end
 
 
 @pytest.mark.slow
-def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other():
+def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other_and_apart():
     keys = jax.random.split(jax.random.key(0), 200)
     grid = np.asarray(jit_unoptimized(jax.vmap(make("race", drones=3).reset))(keys)[1].drones.pos)
     first = np.argmin(grid[..., 1], axis=1)
     np.testing.assert_allclose(np.bincount(first) / len(keys), 1 / 3, atol=0.12)  # 3.6 standard deviations
     env = make("race", drones=3, random_start=True, contact=False)
     worlds = jit_unoptimized(jax.vmap(env.reset))(keys)[1]
-    flying = np.asarray(worlds.drones.pos[:, 0, 2] > 0.1)
-    assert abs(flying.mean() - 0.8) < 0.12
-    index = np.asarray(worlds.variables["index"])[flying]
-    assert index.max() == 3 and index.min() == 0 and np.ptp(index, axis=1).max() <= 1
+    pos, index = np.asarray(worlds.drones.pos), np.asarray(worlds.variables["index"])
+    flying = pos[..., 2] > 0.05
+    assert abs(flying.mean() - 0.5) < 0.08 and 0.5 < np.mean(flying.any(axis=1) > flying.all(axis=1)) < 0.95  # each on its own
+    assert index.max() == 3 and np.all(index[~flying] == 0)
+    apart = np.linalg.norm(pos[:, [0, 0, 1]] - pos[:, [1, 2, 2]], axis=-1)
+    assert apart.min() > 2 * float(np.max(worlds.params.collision_radius))
 
 
 @pytest.mark.slow

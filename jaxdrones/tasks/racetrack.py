@@ -54,7 +54,7 @@ def scene_of(level: int) -> Scene | Callable[[jax.Array], Scene]:
     """
     if level not in LEVELS:
         raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
-    return functools.partial(_random_scene, level) if level > 1 else jax.jit(lambda: _solids(GATES, POLES))()
+    return functools.partial(_random_scene, level) if level > 1 else _nominal_scene(jnp.result_type(float))
 
 
 def randomization_of(level: int) -> tuple[Callable[[jax.Array, Params], Params], ...]:
@@ -143,6 +143,13 @@ METRICS = {
     "gates": shaping.variable("index", "Number of gates passed so far."),
     "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
 }
+
+
+@functools.cache
+def _nominal_scene(dtype: DTypeLike) -> Scene:
+    """Gates and poles of levels 0 and 1, of the default type of numbers."""
+    with jax.ensure_compile_time_eval():
+        return jax.jit(lambda: _solids(GATES, POLES))()
 
 
 def _random_scene(level: int, key: jax.Array) -> Scene:

@@ -145,7 +145,7 @@ class _ManyWorlds:
         """
         axes = tuple(self._in_axes) if isinstance(self._in_axes, Sequence) else (self._in_axes,) * len(arguments)
         worlds = _number_of_worlds(arguments, axes)
-        if worlds and len(self._devices) > 1 and worlds % len(self._devices):
+        if self._devices and worlds % len(self._devices):
             raise UserError(
                 f"{worlds} worlds cannot be shared equally by {len(self._devices)} devices; give a multiple"
             )
@@ -173,7 +173,7 @@ class _ManyWorlds:
 
     def _shared(self, function: Callable, axes: tuple[int, ...]) -> Callable:
         """Function with the worlds sharded over the devices."""
-        if len(self._devices) < 2:
+        if not self._devices:
             return function
         mesh = jax.make_mesh((len(self._devices),), ("worlds",), axis_types=(AxisType.Auto,), devices=self._devices)
         shares = tuple(PartitionSpec(*[None] * axis, "worlds") for axis in axes)

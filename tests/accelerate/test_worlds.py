@@ -373,6 +373,9 @@ from test_worlds import *
 flown = in_chunks(fly, 2, devices=jax.devices())
 args = [jax.tree.map(lambda x: x[:4], x) for x in (starts, commands)]
 assert len(flown(*args).pos.sharding.device_set) == 2
+second = in_chunks(fly, 2, devices=jax.devices()[1:])(*args)
+assert second.pos.sharding.device_set == set(jax.devices()[1:])
+assert_close(second, jax.jit(jax.vmap(fly))(*args), 1e-11)
 assert_close(flown(*args), jax.jit(jax.vmap(fly))(*args), 1e-11)
 by_step = in_chunks(fly, 2, (0, 1), jax.devices())(args[0], args[1].swapaxes(0, 1))
 assert_close(by_step, jax.jit(jax.vmap(fly))(*args), 1e-11)

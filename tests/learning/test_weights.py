@@ -36,6 +36,25 @@ def test_the_policy_is_the_multilayer_perceptron_of_the_weights(per_agent):
     assert policy.per_agent == per_agent and policy.network.hidden_sizes == (5, 4)
 
 
+@pytest.mark.parametrize(
+    ("sizes", "activation", "message"),
+    [
+        ([], "tanh", "layers is empty; give the weight and the bias of each linear layer"),
+        (
+            [(3, 5, 5), (5, 4, 4)],
+            "tanh",
+            r"weight 0 of layers has shape \(3, 5\); expected \(5, 5\): outputs and inputs",
+        ),
+        ([(5, 3, 5), (4, 6, 4)], "tanh", r"weight 1 of layers has shape \(4, 6\); expected \(4, 5\)"),
+        ([(4, 3, 4)], "gelu", "unknown activation 'gelu'.*known: elu, relu, silu, tanh"),
+    ],
+)
+def test_layers_that_do_not_follow_each_other_and_unknown_activations_are_refused(sizes, activation, message):
+    layers = [(np.zeros(weight), np.zeros(bias)) for *weight, bias in sizes]
+    with pytest.raises(ValueError, match=message):
+        mlp_policy(layers, activation=activation)
+
+
 def test_a_training_can_start_from_the_weights_of_another_library():
     """Their network is that of settings with its sizes; the statistics stay, as weights are scaled by 2^20."""
     env = envs.make("hover")

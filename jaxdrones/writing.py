@@ -49,9 +49,14 @@ def beside(file: Path) -> Path:
 def rename(file: Path) -> None:
     """Flush the new file beside a file to the disk, and rename it."""
     new = beside(file)
-    _synchronize(new, os.O_RDWR)
+    flush(new)
     os.replace(new, _target(file))
     _synchronize(new.parent, os.O_RDONLY)
+
+
+def flush(file: Path) -> None:
+    """Flush the content of a file to the disk."""
+    _synchronize(file, os.O_RDWR)
 
 
 def _target(file: Path) -> Path:

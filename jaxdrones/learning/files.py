@@ -39,6 +39,7 @@ def save_bytes(file: Path, content: bytes, **about: Any) -> None:
     _finish(file)
     try:
         new.write_bytes(content)
+        writing.flush(new)
         writing.write(file.with_suffix(".json"), json.dumps(sidecar, indent=2).encode())
     except OSError as error:  # the error of a full disk names no file
         new.unlink(missing_ok=True)

@@ -288,6 +288,23 @@ def test_a_process_that_is_killed_between_two_renames_and_then_while_it_writes_l
         assert run.load_state({"x": np.zeros(3, np.float32)})["x"].tolist() == [2, 2, 2]
 
 
+def test_numbers_are_on_the_disk_before_the_sidecar_that_describes_them(tmp_path, monkeypatch):
+    """A power failure loses what is not flushed."""
+    flushed, fsync, rename = [], os.fsync, os.replace
+
+    def noted(descriptor):
+        flushed.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+        fsync(descriptor)
+
+    def checked(source, target):
+        assert "state.new.msgpack" in flushed
+        rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    monkeypatch.setattr(os, "replace", checked)
+    Run(tmp_path).save_state({"x": np.zeros(3, np.float32)}, update=1)
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"update,reward\n1,x\n", b"reward\n3\n", b"update\n\xff\x00\n", b"update,a\n1,2,3\n"]
 )

@@ -117,6 +117,7 @@ class _Loop:
             self.id, self.state = secrets.token_hex(8), trainer.start(self.key)
             results = self.evaluate(self.state.policy, 0)
             self.first = [{"update": 0, "steps": 0, "seconds": 0.0, **results}]
+        self.saved_reached = self.reached  # by evaluations up to that of `state`
         if deadline is not None:
             self.plan = TimePlan(deadline, self.update, self._evaluations, self.last_evaluation_seconds)
             self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
@@ -147,7 +148,7 @@ class _Loop:
                     elif self.plan is not None:
                         self._set_updates(self.plan.updates(update))
                 progress.add(rows)
-                self.state, self.update = state, update
+                self.state, self.update, self.saved_reached = state, update, self.reached
                 if evaluated or self.seconds - saved > _SAVE_SECONDS:
                     progress.synchronize()
                     self.save()
@@ -203,7 +204,7 @@ class _Loop:
         about = self._about(self.update)
         self.run.save_policy("last", state.policy, **about)
         progress = {"seconds": self.seconds, "evaluation_seconds": self.last_evaluation_seconds}
-        progress |= {"highest_success": self.highest_success, "reached": self.reached}
+        progress |= {"highest_success": self.highest_success, "reached": self.saved_reached}
         progress |= {"evaluating": self.evaluation_seconds}
         self.run.save_state(state, **about, **progress)
 

@@ -136,6 +136,23 @@ def test_a_training_stops_after_three_evaluations_in_a_row_that_reach_its_rate(r
     assert run.recipe().stop_at == rate and trainer.recipe.config.updates == 6
 
 
+def test_an_evaluation_that_is_made_again_counts_once(trainer, tmp_path, monkeypatch):
+    """Ctrl-C after the evaluation of update 1, before its training state is the one to save."""
+    evaluate = trainer.evaluate
+    monkeypatch.setattr(trainer, "evaluate", lambda *of: evaluate(*of).replace(success_interval=(0.5, 1.0)))
+    monkeypatch.setattr(trainer, "recipe", dataclasses.replace(trainer.recipe, stop_at=0.3))
+
+    def interrupted(update, *_):
+        if update == 1:
+            raise KeyboardInterrupt
+
+    run = Run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        loop.train(trainer, run, 3, lambda *_: None, loggers=[interrupted])
+    loop.train(trainer, run, 3, lambda *_: None)
+    assert run.report()["updates"] == 2  # with that of the untrained policy, three evaluations in a row
+
+
 def test_a_resumed_training_keeps_the_highest_success_to_which_the_best_policy_is_tied(trainer, tmp_path, monkeypatch):
     """Of 8 episodes 7 successes are tied with 8, and 6 with 7 but not with 8."""
     scores, evaluate = iter([(1.0, 1.0), (0.875, 2.0), (0.75, 3.0)]), trainer.evaluate

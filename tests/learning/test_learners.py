@@ -374,9 +374,9 @@ def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learn
 
 def test_statistics_forget_what_is_older_than_their_window_of_trajectories_and_are_frozen_in_the_end():
     config = types.SimpleNamespace(obs_stats_window=0.5, obs_stats_freeze=0.4, updates=10)
-    obs, ended = jnp.ones((3, 4, 2, 1)), jnp.asarray(np.arange(4)[:, None] * np.ones((3, 1, 2)) > 2)
+    obs, ended = jnp.ones((3, 4, 2, 5)), jnp.asarray(np.arange(4)[:, None] * np.ones((3, 1, 2)) > 2)
     trajectory = types.SimpleNamespace(obs=obs, was_done=ended)
-    before = RunningStatistics(jnp.zeros(1), jnp.ones(1), jnp.asarray(100.0))
+    before = RunningStatistics(jnp.zeros(5), jnp.ones(5), jnp.asarray(100.0))
     updated = jit_unoptimized(lambda step: collect.update_obs_stats(before, trajectory, config, step))
     after, frozen = map(updated, (3, 4))
     np.testing.assert_allclose(

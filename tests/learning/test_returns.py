@@ -101,7 +101,7 @@ def test_an_episode_weighs_as_many_as_were_restarted_before_their_ends():
     done = t == ends[None]
     trajectory = types.SimpleNamespace(
         done=done,
-        was_done=((t > ends[None]) & (ends >= 0))[..., None],
+        was_done=(t[..., None] + np.arange(2) > ends[:, None]) & (ends[:, None] >= 0),  # a drone ends a step earlier
         length=np.where(done, length, 100),
         episode_return=np.where(done, np.arange(6.0), 50.0)[..., None] * np.ones(2),
         reward=np.zeros((4, 6, 2)),

@@ -44,11 +44,11 @@ class CSV:
             csv.writer(file).writerow([row.get(name, "") for name in self._columns])
 
     def _rows_before(self, update: int) -> list[list[str]]:
-        """Rows of the file of updates before this one."""
+        """Rows of the file of updates before this one, without a truncated last line, as left by a killed process."""
         if update <= 1 or not self._path.exists():
             return []
-        with self._path.open(newline="") as file:
-            columns, *rows = [*csv.reader(file)] or [[]]
+        lines = self._path.read_text().rpartition("\n")[0].splitlines()
+        columns, *rows = [*csv.reader(lines)] or [[]]
         if columns != self._columns:
             raise UserError(f"{self._path} has the columns {', '.join(columns) or 'of no log'}; give another file")
         return [row for row in rows if row and row[0].isdecimal() and int(row[0]) < update]

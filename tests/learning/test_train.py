@@ -345,6 +345,8 @@ def test_the_log_of_a_continued_training_keeps_the_rows_of_earlier_updates(tmp_p
         log = loggers.CSV(file)
         for update in updates:
             log(update, {"reward": 10.0 * len(updates) + update})
+        with file.open("a") as cut:
+            cut.write("1" * (updates[-1] == 3))  # of a row that was being written
     assert file.read_text().split() == ["update,reward", "1,31.0", "2,32.0", "3,23.0", "4,24.0"]
     with pytest.raises(ValueError, match="has the columns update, reward; give another file"):
         loggers.CSV(file)(5, {"error": 1.0})

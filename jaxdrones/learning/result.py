@@ -29,7 +29,6 @@ PATIENCE = 10
 
 _RATE_FACTOR = 1.2  # factor of an adaptation of the learning rate
 
-
 SMALLER = "try a smaller learning rate, for example learning_rate=1e-3"
 _NEVER_FINITE = (
     "no update had finite gradients, so the learning rate is not the cause: look in the task for NaN, large rewards, "
@@ -140,6 +139,8 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             check_function("callback", one, ("update", "metrics", "state"))
         if state is not None:
             _check_state(state, functools.partial(init, env=env, config=config), network)
+        if not is_concrete(config.updates):
+            raise UserError("config.updates is traced; give a number, or take each `update` yourself")
         made = int(state.step) if state is not None and is_concrete(state.step) else 0
         if made >= config.updates:
             raise UserError(f"state has made {made} updates; give more updates, config.updates is {config.updates}")

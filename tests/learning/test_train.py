@@ -206,6 +206,8 @@ def test_a_state_without_updates_left_is_refused_alone_and_in_a_program_of_the_u
     for train in rate_trained, jax.jit(rate_trained):
         with pytest.raises(ValueError, match=r"state has made 4 updates; give more updates, config.updates is 3"):
             train(1e-3)
+    with pytest.raises(ValueError, match=r"config.updates is traced; give a number"):
+        jax.jit(lambda updates: bptt.train(KEY, env, dataclasses.replace(config, updates=updates)))(5)
 
 
 def test_csv_gets_every_update_and_a_missing_library_is_named(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.checks import short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.learning.files import ADVICE, load_bytes, one_line, read_sidecar, save_bytes
 from jaxdrones.learning.networks import MLP, Network, OwnNetwork, Policy
@@ -27,8 +28,10 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
     `about` are entries of the sidecar, such as task, algorithm and settings: JSON values or dataclasses.
 
     Raises:
-        ValueError: a parameter is not finite.
+        ValueError: no policy, or a parameter that is not finite.
     """
+    if not isinstance(policy, Policy):
+        raise UserError(f"policy is {short_repr(policy)}; give a Policy, such as result.policy")
     _check_finite(_arrays_file(Path(path)), policy)
     own = {"network": _settings(policy.network), "per_agent": policy.per_agent}
     save_tree(path, policy, **about, policy=own)

@@ -15,7 +15,7 @@ from jaxdrones.arguments import Count, Key, checked
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
-from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
+from jaxdrones.learning.networks import AnyPolicy, act, check_callable, initial_hidden_state
 from jaxdrones.learning.settings import check_environment
 from jaxdrones.limits import check_memory
 from jaxdrones.pytree import PyTreeNode
@@ -71,9 +71,10 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: Count = 1000) -> R
     called like one; or a recurrent policy, see `learning.networks`.
 
     Raises:
-        ValueError: no random key, or more episodes than fit in memory.
+        ValueError: no policy, no random key, or more episodes than fit in memory.
     """
     check_environment(env)
+    check_callable(policy)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, PyTreeNode):

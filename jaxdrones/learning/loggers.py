@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from jaxdrones import writing
-from jaxdrones.arguments import Count, checked
+from jaxdrones.arguments import Count, Key, checked
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning.evaluation import Report, Score, compile_evaluation, score_of
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.settings import check_environment
 
 
 class CSV:
@@ -117,8 +116,9 @@ class KeepBest:
     """Evaluation of that policy."""
 
     @checked
-    def __init__(self, env: Env, key: jax.Array, every: Count = 20, episodes: Count = 200):
+    def __init__(self, env: Env, key: Key, every: Count = 20, episodes: Count = 200):
         """Evaluate in `env` after `every` updates, always on the same `episodes`, which depend on `key`."""
+        check_environment(env)
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
         self._score: Score | None = None

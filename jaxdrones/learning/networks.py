@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import is_concrete
+from jaxdrones.checks import is_concrete, short_repr
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -33,6 +33,12 @@ class RecurrentPolicy(Protocol):
 
 AnyPolicy = RecurrentPolicy | Callable[[Obs], Array]
 """Recurrent policy, or any function from observations (n, d), or a dictionary with images, to actions (n, a)."""
+
+
+def check_callable(policy: Any) -> None:
+    """Raise for what is neither a recurrent policy nor a function, such as the result of a training."""
+    if not (isinstance(policy, RecurrentPolicy) or callable(policy)):
+        raise UserError(f"policy is {short_repr(policy)}; give a policy, such as result.policy, or a function of obs")
 
 
 def initial_hidden_state(policy: AnyPolicy, drones: int) -> Any:

@@ -320,6 +320,16 @@ def test_the_name_of_a_task_is_no_environment():
         bptt.train(KEY, "hover", SMALL[bptt])
     with pytest.raises(ValueError, match=says):
         evaluate("hover", lambda obs: obs, KEY)
+    with pytest.raises(ValueError, match=says):
+        loggers.KeepBest("hover", KEY)
+
+
+def test_the_result_of_a_training_is_no_policy(tmp_path):
+    trained = result.Result(None, None, {})
+    with pytest.raises(ValueError, match=r"policy is <Result.*; give a policy, such as result\.policy, or a function"):
+        evaluate(DoubleIntegrator(), trained, KEY)
+    with pytest.raises(ValueError, match=r"policy is <Result.*; give a Policy, such as result\.policy"):
+        checkpoint.save(tmp_path / "policy", trained)
 
 
 def test_a_callback_that_is_no_function_is_refused():
@@ -361,6 +371,8 @@ def test_the_log_of_a_continued_training_keeps_the_rows_of_earlier_updates(tmp_p
 def test_evaluations_that_make_no_sense_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} is 0; give a whole number of at least 1"):
         loggers.KeepBest(None, KEY, **{name: 0})
+    with pytest.raises(ValueError, match="key is 0; give a random key"):
+        loggers.KeepBest(None, 0)
 
 
 def test_a_policy_is_not_loaded_into_a_network_of_other_arrays(tmp_path):

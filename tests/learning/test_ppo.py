@@ -105,25 +105,53 @@ def test_a_step_that_counts_has_the_same_weight_on_every_device(monkeypatch):
 
 
 def test_a_step_is_followed_by_the_next_one_or_by_what_was_seen_last(monkeypatch):
-    """The value after a step is that before the next one, and at a cut or in the end that of the last observation."""
-    monkeypatch.setattr(batch, "critic_observation", lambda policy, obs, *_: obs)
+    """The value after a step is that before the next one, and at a cut or in the end that of the last observation.
+
+    The latter has the memory after that observation. Only the first of two drones is cut.
+    """
+    monkeypatch.setattr(batch, "critic_observation", lambda policy, obs, hidden, *_: obs + hidden)
     monkeypatch.setattr(batch, "discounted_value", lambda config, critic, obs: obs[..., 0])
-    obs = jnp.arange(8.0).reshape(4, 2, 1, 1)
-    terminated, truncated = (jnp.array(x)[..., None] for x in ([[0, 0], [1, 0], [0, 0], [0, 0]], [[0, 1], [0, 0]] * 2))
+    obs = jnp.arange(16.0).reshape(4, 2, 2, 1)
+    terminated, truncated = np.zeros((2, 4, 2, 2), bool)
+    terminated[1, 0], truncated[::2, 1, 0] = True, True
     flight = SimpleNamespace(
-        **dict(obs=obs, final_obs=100 + obs, action=obs, extras=obs, reward=jnp.ones((4, 2, 1)), hidden_state=obs),
-        **dict(terminated=terminated == 1, truncated=truncated == 1, was_done=jnp.zeros((4, 2, 1), bool)),
+        **dict(obs=obs, final_obs=100 + obs, action=obs, extras=obs, reward=jnp.ones((4, 2, 2)), hidden_state=0 * obs),
+        **dict(terminated=jnp.asarray(terminated), truncated=jnp.asarray(truncated)),
+        was_done=jnp.zeros((4, 2, 2), bool).at[2:, 0, 1].set(True),
         **dict(done=jnp.array([[0, 1], [1, 0], [0, 1], [0, 1]]) == 1, privileged=None, final_privileged=None),
     )
-    policy = SimpleNamespace(act=lambda hidden, obs: (hidden, obs), obs_stats=SimpleNamespace(normalize=lambda x: x))
+    policy = SimpleNamespace(
+        act=lambda hidden, obs: (hidden + 1000, obs), obs_stats=SimpleNamespace(normalize=lambda x: x)
+    )
     state = SimpleNamespace(policy=policy, critic=None, log_std=jnp.zeros(1))
-    found = batch.batch_of(ppo.Config(gae_lambda=0.0, gamma=0.5), state, obs[0], flight, jnp.zeros((3, 2, 1, 1)))
-    following = np.array([[2, 101], [0, 5], [6, 105], [106, 107]])  # 0 after a termination
-    np.testing.assert_allclose(found.value_target[..., 0], 1 + 0.5 * following)
+    noise = jnp.zeros((3, 2, 2, 1))
+    config = ppo.Config(gae_lambda=0.0, gamma=0.5)
+    found, alone = jit_unoptimized(
+        lambda: [batch.batch_of(config, state, obs[0], flight, noise, ends_alone) for ends_alone in (False, True)]
+    )()
+    following = np.array([[4, 1102], [0, 10], [12, 1110], [1112, 1114]])[..., None] + np.arange(2)
+    following[1, 0] = 0  # after a termination
+    np.testing.assert_allclose(found.value_target, 1 + 0.5 * following)
     np.testing.assert_array_equal(found.starts, [[0, 0], [0, 1], [1, 0], [0, 1]])
     advantage = found.value_target - obs[..., 0]
     normalized = (advantage - np.mean(advantage)) / np.std(advantage)  # over all steps of all worlds
     np.testing.assert_allclose(found.advantage, normalized, rtol=1e-6)
+    advantage = advantage[alone.valid]
+    np.testing.assert_allclose(alone.advantage[alone.valid], (advantage - np.mean(advantage)) / np.std(advantage), 1e-6)
+
+
+def test_a_minibatch_has_all_steps_of_equally_spaced_worlds():
+    number = jnp.arange(24).reshape(2, 4, 3)
+    expected = np.stack([number[:, i::2] for i in range(2)])
+    for starts, per_agent, shape in (
+        (None, False, (2, 12)),
+        (None, True, (2, 4, 3)),
+        (number[..., 0], True, (2, 2, 2, 3)),
+    ):
+        cut = batch.minibatches(
+            SimpleNamespace(minibatches=2, per_agent=per_agent), ppo.Batch(*6 * [number], starts=starts)
+        )
+        np.testing.assert_array_equal(cut.advantage, expected.reshape(shape))
 
 
 def test_no_noise_of_an_update_is_used_twice(monkeypatch):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.learning.collect import Worlds
-from jaxdrones.learning.metrics import mean_return, measure, with_returns
+from jaxdrones.learning.metrics import mean_return, measure, with_returns, with_unknown, without_unknown
 from jaxdrones.learning.returns import advantages, discounted_rewards
 
 T, W = 12, 5
@@ -92,6 +92,19 @@ def test_the_metrics_of_an_update_are_means_over_the_steps_of_episodes():
         assert metrics["reward"] == 1 and metrics["error"] == 2  # of 0, 1, and 2
         np.testing.assert_allclose(metrics["termination_rate"], 1 / 3)
     np.testing.assert_array_equal([metrics["return"] for metrics in found], [np.nan, 3.5])  # whole episodes take 2
+    config.restart_fraction = 1.0  # then an episode is whole only within a trajectory
+    for horizon, mean in (3, np.nan), (6, 3.5):
+        config.horizon = horizon
+        np.testing.assert_array_equal(measure(env, config, jnp.asarray(9), worlds, trajectory)[1]["return"], mean)
+
+
+def test_a_return_before_the_first_is_no_number_only_outside_of_a_program():
+    metrics = {"reward": jnp.ones(2), "return": jnp.array([jnp.nan, 3.0])}
+    inside = without_unknown(metrics)
+    assert all(np.all(np.isfinite(x)) for x in inside.values())
+    outside = with_unknown(inside)
+    assert outside.keys() == metrics.keys()
+    np.testing.assert_array_equal(outside["return"], metrics["return"])
 
 
 def test_an_episode_weighs_as_many_as_were_restarted_before_their_ends():

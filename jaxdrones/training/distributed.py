@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from jaxdrones.arguments import Count, checked
+from jaxdrones.arguments import Count, Seconds, checked
 from jaxdrones.errors import UserError
 
 _TIMEOUT = 60.0  # s; timeout of the connection at the start
@@ -22,7 +22,7 @@ _READY = b"ready"  # answer of host 0
 
 @checked
 @contextlib.contextmanager
-def join_hosts(hosts: Count, host: int, coordinator: str, timeout: float = _TIMEOUT) -> Iterator[None]:
+def join_hosts(hosts: Count, host: int, coordinator: str, timeout: Seconds = _TIMEOUT) -> Iterator[None]:
     """Context of one of several hosts, counted from 0; enter it before any other use of JAX.
 
     `coordinator` is the address and a free port of host 0, such as 127.0.0.1:9911; `timeout` is the time to wait for

@@ -141,6 +141,7 @@ def test_a_host_that_is_left_alone_says_so(host):
     [
         ((2, 2, "127.0.0.1:1"), "host is 2; give 0 to 1"),
         ((0, 0, "127.0.0.1:1"), "hosts is 0"),
+        ((2, 0, "127.0.0.1:1", float("nan")), "timeout is nan; give a positive number"),
         ((2, 0, "127.0.0.1"), "coordinator is '127.0.0.1'; give ADDRESS:PORT"),
     ],
 )

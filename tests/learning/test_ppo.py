@@ -30,13 +30,14 @@ def test_the_loss_of_ppo_has_no_gradient_where_the_clipped_ratio_is_worse_and_fa
         batch = ppo.Batch(zero, zero, behavior, zero, jnp.full((1, 1), advantage), jnp.zeros((1, 1)))
         return ppo.loss(dataclasses.replace(config, entropy_coef=entropy_coef), policy, log_std, None, batch)[0]
 
-    slopes = {ratio: slope_of(jnp.zeros(1), ratio, 0.0).item() for ratio in (0.7, 0.9, 1.1, 1.3)}
-    clipped = 1.3 if advantage > 0 else 0.7
+    slopes = {ratio: slope_of(jnp.zeros(1), ratio, 0.0).item() for ratio in (0.79, 0.81, 1.19, 1.21)}
+    clipped = 1.21 if advantage > 0 else 0.79
     assert [ratio for ratio, slope in slopes.items() if slope == 0] == [clipped]
     assert slope_of(jnp.zeros(1), clipped, 0.1).item() == pytest.approx(-0.1)
+    assert slope_of(jnp.zeros(1), 1e30, 0.0).item() == 0  # beyond any range
 
 
-def test_the_error_of_the_values_counts_by_its_weight_in_units_of_a_reward(monkeypatch):
+def test_the_error_of_the_values_counts_by_its_weight_in_units_of_a_reward_and_the_entropy_by_its_own(monkeypatch):
     monkeypatch.setattr(ppo, "discounted_value", lambda config, critic, obs: obs)
     policy, zero = SimpleNamespace(replay=lambda memory, obs, starts: obs), jnp.zeros((2, 1))
     batch = ppo.Batch(zero[..., None], zero[..., None], zero, jnp.array([[3.0], [5.0]]), zero, zero + 1)
@@ -44,6 +45,9 @@ def test_the_error_of_the_values_counts_by_its_weight_in_units_of_a_reward(monke
         config = ppo.Config(gamma=0.75, value_coef=value_coef)
         loss, metrics = ppo.loss(config, policy, jnp.zeros(1), None, batch)
         assert metrics["value_loss"] == (0.5**2 + 1.0**2) / 2 and loss == value_coef * metrics["value_loss"]
+    config, std = ppo.Config(value_coef=0.0, entropy_coef=2.0), np.array([0.5])
+    loss, _ = ppo.loss(config, policy, jnp.log(std), None, batch)
+    assert loss == pytest.approx(-2 * np.log(0.5 * np.sqrt(2 * np.pi * np.e)))
 
 
 def test_the_divergence_of_ppo_is_that_of_the_updated_policy_seen_from_the_behavior_policy(monkeypatch):
@@ -173,3 +177,5 @@ def test_no_noise_of_an_update_is_used_twice(monkeypatch):
         ppo.update(env, config, state)
     assert [x.shape for x in drawn] == [(12, 4, 2, 3), (4, 4, 2, 3)]  # at most 3 truncations, and the last step
     assert len(np.unique(np.concatenate(drawn))) == 16 * 4 * 2 * 3
+    env.task.truncations = ("lost",)
+    assert ppo._most_truncations(env, 12) == 12  # in every step

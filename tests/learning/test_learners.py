@@ -544,21 +544,84 @@ def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_i
 
 @pytest.mark.float32
 def test_policy_standard_deviation_and_critic_of_ppo_move_by_their_learning_rates():
-    """The first step of Adam is as long as the learning rate in every parameter with a gradient."""
+    """The first step of Adam is as long as the learning rate in every parameter with a gradient.
+
+    The entropy has such a weight that the standard deviation rises.
+    """
     env, rates = DoubleIntegrator(), jnp.array([1e-4, 1e-2])
-    config = dataclasses.replace(SMALL[ppo], epochs=1, minibatches=1, critic_learning_rate=1e-3)
+    config = dataclasses.replace(SMALL[ppo], epochs=1, minibatches=1, critic_learning_rate=1e-3, entropy_coef=10.0)
 
     def largest_steps(rate):
         before = ppo.init(jax.random.key(0), env, dataclasses.replace(config, learning_rate=rate))
         before = before.replace(log_std=before.log_std - 0.5)  # within its bounds
         after, _ = ppo.update(env, config, before)
-        of = lambda state: (state.policy.params, state.log_std, state.critic)  # noqa: E731
+        of = lambda state: (state.policy.params, state.critic)  # noqa: E731
         steps = jax.tree.map(lambda x, y: jnp.max(jnp.abs(y - x)), of(before), of(after))
-        return [jnp.max(jnp.stack(jax.tree.leaves(step))) for step in steps]
+        policy, critic = (jnp.max(jnp.stack(jax.tree.leaves(step))) for step in steps)
+        return policy, (after.log_std - before.log_std)[0], critic
 
     policy, log_std, critic = jit_unoptimized(jax.vmap(largest_steps))(rates)
     np.testing.assert_allclose([policy, log_std], [rates, rates], rtol=0.01)  # the parameters are rounded
     np.testing.assert_allclose(critic, [1e-3, 1e-3], rtol=0.01)
+
+
+class Drawn(Exception):
+    """The end of what a test looks at."""
+
+
+def are_different(keys):
+    return len({jax.random.key_data(key).tobytes() for key in keys}) == len(keys)
+
+
+@pytest.mark.parametrize("learner", [bptt, ppo, shac], ids=name_of)
+def test_every_draw_of_an_update_has_a_key_of_its_own(learner, monkeypatch):
+    keys = [jax.random.key(0)]
+
+    def drawn(key, *_, **__):
+        keys.append(key)
+        return types.SimpleNamespace(hidden_state=None)
+
+    def last(key, *_, **__):
+        keys.append(key)
+        raise Drawn
+
+    for name, function in {"draw_starts": drawn, "restart": drawn, "collect": last}.items():
+        monkeypatch.setattr(collect, name, function)
+    policy = types.SimpleNamespace(params=0.0, replace=lambda **_: None)
+    state = types.SimpleNamespace(key=keys[0], step=0, worlds=None, policy=policy, log_std=jnp.zeros(1))
+    with pytest.raises(Drawn):
+        learner.update(DoubleIntegrator(), SMALL[learner], state)
+    assert len(keys) == 4 and are_different(keys)
+
+
+@pytest.mark.parametrize("learner", [ppo, shac], ids=name_of)
+def test_policy_and_critic_are_drawn_from_keys_of_their_own(learner, monkeypatch):
+    keys = [jax.random.key(0)]
+
+    def last(key, *_):
+        keys.append(key)
+        raise Drawn
+
+    monkeypatch.setattr(learner.result, "init_policy", lambda key, *_: keys.append(key))
+    monkeypatch.setattr(learner, "init_critic", last)
+    with pytest.raises(Drawn):
+        learner.init(keys[0], DoubleIntegrator(), SMALL[learner])
+    assert len(keys) == 3 and are_different(keys)
+
+
+def test_the_critic_of_shac_learns_from_steps_that_a_key_of_its_own_draws(monkeypatch):
+    keys = [jax.random.key(0)]
+
+    def last(key, *_):
+        keys.append(key)
+        raise Drawn
+
+    monkeypatch.setattr(bptt, "policy_step", lambda env, config, state, own, *_, **__: (state, None, keys.extend(own)))
+    monkeypatch.setattr(shac.sharding, "map_worlds", lambda *_: last)
+    state = types.SimpleNamespace(key=keys[0], step=0, replace=lambda **_: None)
+    with pytest.raises(Drawn):
+        shac.update(None, SMALL[shac], state)
+    assert len(keys) == 5 and are_different(keys)
 
 
 def optax_norm(tree):

@@ -161,17 +161,18 @@ def test_a_minibatch_has_all_steps_of_equally_spaced_worlds():
 def test_no_noise_of_an_update_is_used_twice(monkeypatch):
     """The actions of the trajectory and those with which the critic is bootstrapped are drawn independently."""
     env = SimpleNamespace(drones=2, action_size=3, steps=5, task=SimpleNamespace(truncations=(), ends="team"))
-    config, drawn = ppo.Config(worlds=4, horizon=12, minibatches=2), []
+    config, drawn = ppo.Config(worlds=4, horizon=12, minibatches=2, privileged_critic=True), []
     state = ppo.TrainState(0, jax.random.key(0), None, None, None, jnp.zeros(3), None, None)
 
     def learn(state, hidden_state, trajectory, noise):
         drawn.append(noise)
+        assert trajectory is config.privileged_critic
         raise StopIteration
 
     for name in ("draw_starts", "progress_of"):
         monkeypatch.setattr(ppo.collect, name, lambda *_: None)
     monkeypatch.setattr(ppo.collect, "restart", lambda *_: SimpleNamespace(hidden_state=None))
-    monkeypatch.setattr(ppo.collect, "collect", lambda *_, noise, **__: (None, drawn.append(noise)))
+    monkeypatch.setattr(ppo.collect, "collect", lambda *_, noise, privileged, **__: (drawn.append(noise), privileged))
     monkeypatch.setattr(ppo.sharding, "map_worlds", lambda *_: learn)
     with pytest.raises(StopIteration):
         ppo.update(env, config, state)

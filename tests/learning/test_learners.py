@@ -393,21 +393,23 @@ def test_the_network_of_a_critic_has_outputs_of_the_size_of_a_reward(monkeypatch
 
 @pytest.fixture
 def three_worlds(monkeypatch):
-    """Trajectory of worlds that go on, are truncated in step 0, and terminate in step 1; values are the observations.
+    """Trajectory of worlds that go on, are truncated in step 0, and terminate in step 1; values are what is seen.
 
-    Those at the end of a step are 8, 16 and 24; those at its start are 7, 15 and 23. Critics are factors of them.
+    This is the sum of observation, memory after it, and privileged observation: 8, 16 and 24 at the end of a step, 7,
+    15 and 23 at its start. Critics are factors of it.
     """
-    monkeypatch.setattr(shac, "critic_observation", lambda policy, obs, *_: obs)
+    monkeypatch.setattr(shac, "critic_observation", lambda policy, *seen: sum(seen))
     monkeypatch.setattr(shac, "discounted_value", lambda config, critic, obs: critic * obs[..., 0])
     obs = jnp.broadcast_to(8.0 * jnp.arange(1, 4)[:, None, None, None], (3, 3, 1, 1))
     truncated, terminated, was_done = np.zeros((3, 3, 3, 1), bool)
     truncated[0, 1], terminated[1, 2], was_done[1:, 1], was_done[2:, 2] = True, True, True, True
     ends = dict(truncated=truncated, terminated=terminated, was_done=was_done)
-    own = {"reward": jnp.ones((3, 3, 1)), "obs": obs - 1, "final_obs": obs} | jax.tree.map(jnp.asarray, ends)
+    seen = dict(obs=obs - 1, hidden_state=0 * obs, privileged=0 * obs, final_obs=obs - 2, final_privileged=0 * obs + 1)
+    own = {"reward": jnp.ones((3, 3, 1))} | seen | jax.tree.map(jnp.asarray, ends)
     return collect.Trajectory(**dict.fromkeys(collect.Trajectory.__dataclass_fields__) | own)
 
 
-ACTS = types.SimpleNamespace(act=lambda hidden, obs: (hidden, obs))
+ACTS = types.SimpleNamespace(act=lambda hidden, obs: (hidden + 1, obs))
 
 
 @pytest.mark.parametrize(("step", "weight"), [(3, 0.5), (9, 1.0)])
@@ -423,6 +425,8 @@ def test_the_cost_of_shac_is_that_of_the_discounted_rewards_and_of_the_value_aft
     worth = [1 + 1 / 2 + 1 / 4 + weight * 24 / 8, 1 + weight * 8 / 2, 1 + 1 / 2]
     cost = jit_unoptimized(lambda trajectory: costs[0](ACTS, trajectory))
     np.testing.assert_allclose(cost(three_worlds), -np.mean(worth) / 3)
+    failed = three_worlds.replace(terminated=three_worlds.terminated.at[-1, 0].set(True))
+    np.testing.assert_allclose(cost(failed), -np.mean([1 + 1 / 2 + 1 / 4, *worth[1:]]) / 3)
 
 
 def test_the_critic_of_shac_learns_the_values_of_the_target_critic_in_steps_that_count(three_worlds):
@@ -453,7 +457,8 @@ def test_the_critic_of_shac_learns_from_every_step_of_a_trajectory(three_worlds)
         reward = 1.0 * (jnp.arange(5) == rewarded)[:, None, None]
         never, obs = jnp.zeros((5, 1, 1), bool), jnp.zeros((5, 1, 1, 1))
         ends = dict(truncated=never, terminated=never, was_done=never)
-        trajectory = three_worlds.replace(reward=reward, obs=obs, final_obs=obs, **ends)
+        names = ("obs", "hidden_state", "privileged", "final_obs", "final_privileged")
+        trajectory = three_worlds.replace(reward=reward, **dict.fromkeys(names, obs), **ends)
         return shac._fit_critic(config, jax.random.key(0), state, trajectory)[2]["loss"]
 
     losses = jit_unoptimized(jax.vmap(loss))(jnp.arange(5))
@@ -609,19 +614,24 @@ def test_policy_and_critic_are_drawn_from_keys_of_their_own(learner, monkeypatch
     assert len(keys) == 3 and are_different(keys)
 
 
-def test_the_critic_of_shac_learns_from_steps_that_a_key_of_its_own_draws(monkeypatch):
-    keys = [jax.random.key(0)]
+def test_an_update_of_shac_has_a_key_for_its_critic_and_counts_the_gradients_of_policy_and_critic(monkeypatch):
+    keys, fitted = [jax.random.key(0)], (jnp.ones(()), None, {"loss": 5.0, "nonfinite_gradients": 3})
 
-    def last(key, *_):
+    def policy_step(env, config, state, own, *_, **__):
+        keys.extend(own)
+        return state, None, {"nonfinite_gradients": 4}
+
+    def fit(key, *_):
         keys.append(key)
-        raise Drawn
+        return fitted
 
-    monkeypatch.setattr(bptt, "policy_step", lambda env, config, state, own, *_, **__: (state, None, keys.extend(own)))
-    monkeypatch.setattr(shac.sharding, "map_worlds", lambda *_: last)
-    state = types.SimpleNamespace(key=keys[0], step=0, replace=lambda **_: None)
-    with pytest.raises(Drawn):
-        shac.update(None, SMALL[shac], state)
-    assert len(keys) == 5 and are_different(keys)
+    monkeypatch.setattr(bptt, "policy_step", policy_step)
+    monkeypatch.setattr(shac.sharding, "map_worlds", lambda *_: fit)
+    state = types.SimpleNamespace(key=keys[0], step=0, target_critic=jnp.zeros(()), replace=lambda **new: new)
+    after, metrics = shac.update(None, SMALL[shac], state)
+    keys.append(after["key"])
+    assert len(keys) == 6 and are_different(keys)
+    assert metrics == {"critic_loss": 5.0, "nonfinite_gradients": 7}
 
 
 def optax_norm(tree):

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from double_integrator import SMALL, DoubleIntegrator
 
@@ -121,6 +122,12 @@ def test_only_a_gradient_longer_than_the_limit_is_shortened():
     clip = jax.jit(lambda x: clip_gradient(0.5).update({"x": x}, None)[0]["x"])
     np.testing.assert_allclose(clip(jnp.array([0.3, 0.4])), [0.3, 0.4])
     np.testing.assert_allclose(clip(jnp.array([3.0, 4.0])), [0.3, 0.4])
+
+
+def test_adam_averages_squared_gradients_over_as_many_updates_as_its_setting_says():
+    optimizer = bptt.optimizer(bptt.Config(adam_b2=0.75))
+    _, after = optimizer.update(jnp.array([0.1, 0.2]), optimizer.init(jnp.zeros(2)))
+    np.testing.assert_allclose(optax.tree.get(after, "nu"), [0.25 * 0.01, 0.25 * 0.04], rtol=1e-5)
 
 
 def test_the_learning_rate_follows_the_divergence_within_bounds_that_are_annealed():

@@ -125,11 +125,17 @@ def test_every_snapshot_takes_the_place_of_the_oldest_past_policy(monkeypatch):
     assert kept == [[0, 0]] + [[0, 2]] * 2 + [[4, 2]] * 2 + [[4, 6]] * 2
 
 
-def test_worlds_that_past_policies_cannot_share_are_a_mistake():
+def test_worlds_that_past_policies_cannot_share_and_policies_with_a_memory_are_mistakes(monkeypatch):
     with pytest.raises(ValueError, match="worlds is 5; give a multiple of past_policies, 2"):
         league.Config(**SMALL | {"worlds": 5}, past_policies=2)
     with pytest.raises(ValueError, match="one policy for all drones"):
         league.Config(**SMALL, past_policies=2, per_agent=True)
+    with pytest.raises(ValueError, match="without a hidden state; remove per_agent and GRU"):
+        league.Config(**SMALL, past_policies=2, recurrent_size=3)
+    recurrent = types.SimpleNamespace(policy=types.SimpleNamespace(is_recurrent=True))
+    monkeypatch.setattr(bptt, "init", lambda *_: recurrent)
+    with pytest.raises(ValueError, match="network is recurrent; give a league one without a hidden state"):
+        league.init(KEY, None, CONFIG, network=None)
 
 
 def test_every_device_has_worlds_for_every_past_policy(monkeypatch):

@@ -254,22 +254,27 @@ def test_memory_begins_anew_with_every_episode_and_what_is_recorded_is_of_the_ob
 @pytest.mark.parametrize("learner", mostly_slow(SMALL, [bptt, ppo]), ids=name_of)
 def test_a_fraction_of_the_worlds_starts_new_episodes_before_an_update_and_the_others_continue_theirs(learner):
     env = DoubleIntegrator()
+    steps = jnp.array([11, 11, 12])  # after 12 updates no episode can have ended, after 13 one can
 
-    def updated(restart_fraction):
+    def updated(restart_fraction, step):
         config = dataclasses.replace(SMALL[learner], restart_fraction=restart_fraction)
         state = learner.init(jax.random.key(0), env, config)
         worlds = state.worlds.replace(
             episodes=state.worlds.episodes.replace(length=jnp.full(4, 7, jnp.int32)), done=jnp.zeros(4, bool)
         )
-        after, _ = learner.update(env, config, state.replace(worlds=worlds))
+        worlds = worlds.replace(last_weight=jnp.ones(4))
+        after, metrics = learner.update(env, config, state.replace(worlds=worlds, step=step))
         counts = [count for _, count in optax.tree.get_all_with_path(after.opt_state, "count")]
         keys = jax.random.key_data(state.key), jax.random.key_data(after.key)
-        return after.worlds.episodes.length, (keys, after.step, counts)
+        return after.worlds.episodes.length, (keys, after.step, counts, metrics["return"])
 
-    (none, all_worlds), (keys, step, counts) = jit_unoptimized(jax.vmap(updated))(jnp.array([0.0, 1.0]))
+    (none, all_worlds, _), rest = jit_unoptimized(jax.vmap(updated))(jnp.array([0.0, 1.0, 0.0]), steps)
+    keys, step, counts, returns = rest
     np.testing.assert_array_equal(none, 7 + SMALL[learner].horizon)
     np.testing.assert_array_equal(all_worlds, SMALL[learner].horizon)
-    assert not np.array_equal(*keys) and np.all(step == 1)  # the next update draws, and counts, anew
+    assert not np.array_equal(*keys)  # the next update draws anew
+    np.testing.assert_array_equal(step, steps + 1)
+    np.testing.assert_array_equal(np.isnan(returns), [True, True, False])
     gradient_steps = SMALL[ppo].epochs * SMALL[ppo].minibatches if learner is ppo else 1
     np.testing.assert_array_equal(counts, np.full_like(counts, gradient_steps))
 

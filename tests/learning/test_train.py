@@ -16,7 +16,7 @@ from double_integrator import SMALL, Cue, DoubleIntegrator
 from flax import nnx
 from helpers import assert_close, jit_unoptimized, mostly_slow, name_of
 
-from jaxdrones.learning import bptt, checkpoint, evaluate, loggers, ppo, result
+from jaxdrones.learning import Diverged, bptt, checkpoint, evaluate, loggers, ppo, result
 from jaxdrones.learning.networks import MLP, OwnNetwork, Policy
 
 KEY = jax.random.key(0)
@@ -198,16 +198,34 @@ def test_a_training_continues_from_all_that_is_in_its_state(learner):
 
 def test_a_state_without_updates_left_is_refused_alone_and_in_a_program_of_the_user():
     env, config = DoubleIntegrator(), SMALL[bptt]
-    state = jit_unoptimized(lambda: bptt.init(KEY, env, config))().replace(step=jnp.asarray(config.updates + 1))
+    state = jit_unoptimized(lambda: bptt.init(KEY, env, config))().replace(step=jnp.asarray(config.updates))
 
     def rate_trained(learning_rate):
         return bptt.train(KEY, env, dataclasses.replace(config, learning_rate=learning_rate), state=state)
 
     for train in rate_trained, jax.jit(rate_trained):
-        with pytest.raises(ValueError, match=r"state has made 4 updates; give more updates, config.updates is 3"):
+        with pytest.raises(ValueError, match=r"state has made 3 updates; give more updates, config.updates is 3"):
             train(1e-3)
     with pytest.raises(ValueError, match=r"config.updates is traced; give a number"):
         jax.jit(lambda updates: bptt.train(KEY, env, dataclasses.replace(config, updates=updates)))(5)
+
+
+def counted(env, config, state):
+    """Update that only counts, with gradients that are not finite."""
+    return state.replace(step=state.step + 1), {"nonfinite_gradients": jnp.ones((), int)}
+
+
+def test_a_training_continued_in_a_program_of_the_user_makes_the_updates_that_are_left():
+    env, config, train = DoubleIntegrator(), SMALL[bptt], result.make_train(bptt.Config, bptt.init, counted)
+    state = jit_unoptimized(lambda: bptt.init(KEY, env, config))().replace(step=jnp.asarray(1))
+    trained = jax.jit(lambda: train(KEY, env, config, state=state))()
+    assert trained.train_state.step == config.updates and len(trained.history["nonfinite_gradients"]) == 2
+
+
+def test_a_training_of_few_updates_that_all_fail_has_diverged():
+    train = result.make_train(bptt.Config, bptt.init, counted)
+    with pytest.raises(Diverged, match="gradients were not finite in 3 updates in a row; no update had finite"):
+        train(KEY, DoubleIntegrator(), SMALL[bptt])
 
 
 def test_csv_gets_every_update_and_a_missing_library_is_named(tmp_path, monkeypatch):
@@ -348,6 +366,9 @@ def test_a_true_boolean_of_any_library_stops_a_training_and_no_other_answer_does
     for answer, updates in (*answers, (np.ones(2), 3)):
         trained = train(KEY, env, SMALL[bptt], callback=lambda *_, answer=answer: answer)
         assert int(trained.train_state.step) == updates, answer
+    seen = []  # by a callback beside one that stops the training
+    train(KEY, env, SMALL[bptt], callback=[lambda *_: True, lambda update, *_: seen.append(update)])
+    assert seen == [1]
 
 
 def test_the_log_of_a_continued_training_keeps_the_rows_of_earlier_updates(tmp_path):

@@ -1,6 +1,8 @@
 """Gradient options change the gradient as they say, and never what is simulated."""
 
 import dataclasses
+import types
+from collections.abc import Callable
 
 import jax
 import jax.flatten_util
@@ -69,7 +71,10 @@ def test_between_steps_gradients_decay_and_outliers_are_limited():
         return jax.grad(lambda x: jnp.sum(slopes * between(x)))(jnp.ones(3))
 
     decay, limit = dict(gradient="decay", gradient_decay=0.5), dict(outlier_gradient=2.0)
-    found = jit_unoptimized(lambda: [gradient(), gradient(**decay), gradient(**limit), gradient(**decay, **limit)])()
+    other = dict(gradient="surrogate", gradient_decay=0.5)
+    found = jit_unoptimized(
+        lambda: [gradient(**other), gradient(**decay), gradient(**limit), gradient(**decay, **limit)]
+    )()
     np.testing.assert_allclose(found, [[1, 1, 100], [0.5, 0.5, 50], [1, 1, 2], [0.5, 0.5, 1]], rtol=1e-12)
 
 
@@ -170,18 +175,42 @@ def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
 def test_a_point_mass_is_pushed_by_thrust_and_by_turning_the_thrust_and_its_attitude_has_no_gradient():
     dt, response = 0.02, 0.1
     params = jd.repeat(jd.load_params("cf2x"), 1)
-    hover = jnp.full((1, 4), params.hover_rpm[0])
-    state = jd.State.at_rest(jnp.zeros((1, 3))).replace(rpm=hover)
+    limit = params.max_rpm[0]
+    rpm = params.hover_rpm[0] * jnp.array([[1.1, 0.9, 1.0, 0.0]]) + jnp.array([[0.0, 0.0, 0.0, 2 * limit]])
+    state = jd.State.at_rest(jnp.zeros((1, 3)))
     derivatives = jax.jacrev(lambda state, rpm: point_mass(dt, response)(params, state, rpm), (0, 1))
-    after = jit_unoptimized(derivatives)(state, hover)
+    after = jit_unoptimized(derivatives)(state, rpm)
     (pos_of_state, pos_of_rpm), (vel_of_state, vel_of_rpm) = after.pos, after.vel
-    thrust = 2 * params.kf[0] * hover[0]  # of each rotor per RPM
+    limited = jnp.minimum(rpm[0], limit)
+    thrust = 2 * params.kf[0] * limited * (rpm[0] < limit)  # of each rotor per RPM
+    acc = jnp.sum(params.kf[0] * limited**2) / params.mass[0]
     np.testing.assert_allclose(vel_of_rpm[0, 2, 0], thrust / params.mass[0] * dt, rtol=1e-9)
     pitch_acc = -params.rotor_pos[0, :, 0] * thrust / params.inertia[0, 1]  # about y
-    np.testing.assert_allclose(vel_of_rpm[0, 0, 0], pitch_acc * dt * response * params.gravity[0] * dt, rtol=1e-9)
+    np.testing.assert_allclose(vel_of_rpm[0, 0, 0], pitch_acc * dt * response * acc * dt, rtol=1e-9)
     np.testing.assert_allclose(pos_of_rpm, vel_of_rpm * dt, rtol=1e-12)
     np.testing.assert_allclose(pos_of_state.vel[0, :, 0], dt * np.eye(3))
     assert not jnp.any(vel_of_state.quat) and not jnp.any(vel_of_state.omega) and not jnp.any(after.quat[1])
+
+
+def test_sensors_measure_the_physics_and_not_its_surrogate():
+    physics = types.SimpleNamespace(physics=None, period=None, rate=lambda *inputs: inputs)
+    assert SurrogateStep(physics, point_mass(0.01)).rate(1, 2, 3, 4) == (1, 2, 3, 4)
+
+
+@dataclasses.dataclass
+class Eye:
+    render: Callable
+
+
+@dataclasses.dataclass
+class Seeing:
+    vision: Eye
+
+
+@pytest.mark.parametrize(("image_gradient", "slope"), [(True, 6.0), (False, 0.0)])
+def test_what_is_rendered_is_a_constant_for_the_gradient_if_the_setting_says_so(image_gradient, slope):
+    seeing = with_gradient(Seeing(Eye(jnp.square)), bptt.Config(image_gradient=image_gradient))
+    assert jax.value_and_grad(seeing.vision.render)(3.0) == (9.0, slope)
 
 
 @pytest.mark.slow

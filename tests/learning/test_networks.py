@@ -1,3 +1,5 @@
+import types
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -6,8 +8,8 @@ import pytest
 
 from jaxdrones import envs
 from jaxdrones.learning.critic import centralized_input
-from jaxdrones.learning.layers import CNN, IMAGE_CHANNELS, convolutions
-from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.layers import CNN, IMAGE_CHANNELS, _kernel_init, _orthogonal_gates, _patches, convolutions
+from jaxdrones.learning.networks import Policy, apply, init_params
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +53,20 @@ def test_a_policy_is_the_same_for_one_world_and_for_many(team):
     np.testing.assert_allclose(policy(obs)[1, 2], policy(obs[1, 2]), rtol=1e-12)
 
 
+def test_every_drone_has_its_own_parameters_and_memory_also_in_a_sequence():
+    """A network of two drones in three worlds, with a memory of four numbers, over five steps."""
+    drawn = types.SimpleNamespace(
+        init=lambda key, example: jax.random.uniform(key) * example,
+        apply=lambda params, x, memory, starts: (x, params[0] * x + memory[None, :, :1]),
+    )
+    params = init_params(jax.random.key(0), drawn, jnp.ones(1), agents=2)
+    assert params.shape == (2, 1) and params[0] != params[1]
+    x, memory = jnp.arange(30.0).reshape(5, 3, 2, 1), jnp.arange(24.0).reshape(3, 2, 4)
+    output = apply(drawn, params, x, True, memory, jnp.zeros((5, 3), bool))[1]
+    expected = np.asarray(x) * np.asarray(params) + np.asarray(memory)[..., :1]
+    np.testing.assert_allclose(output, expected, rtol=1e-6)
+
+
 def test_the_central_critic_of_the_paper_sees_25_numbers_its_own_first():
     obs = jnp.arange(24.0).reshape(2, 12)
     action = jnp.array([[100.0], [200.0]])
@@ -73,6 +89,32 @@ def test_a_layer_of_the_cnn_is_a_convolution():
     params = params | {"Dense_0": params["Dense_0"] | {"bias": jnp.ones(5)}}
     expected = nn.relu(found.reshape(2, -1) @ head["kernel"] + head["bias"][None])
     np.testing.assert_allclose(cnn.apply({"params": params}, picture), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_large_images_are_reduced_by_four_and_small_ones_by_two_to_at_most_20_pixels():
+    assert convolutions(48, 64) == ((16, 32), (4, 4))
+    assert convolutions(12, 16) == ((16,), (4,))
+    assert convolutions(9, 9) == ((16, 32), (2, 2)) and convolutions(4, 5) == ((), ())
+
+
+def test_squares_of_an_image_are_padded_with_nothing_on_both_sides():
+    image = np.arange(1.0, 16.0).reshape(5, 3, 1)
+    squares = _patches(jnp.asarray(image), 4)
+    framed = np.pad(image[..., 0], ((1, 2), (0, 1)))
+    np.testing.assert_array_equal(squares, [[framed[:4].ravel()], [framed[4:].ravel()]])
+
+
+def test_the_first_weights_are_normal_with_the_scale_of_the_outputs():
+    kernel = _kernel_init(0.1)(jax.random.key(0), (100, 50))
+    assert np.std(kernel) == pytest.approx(0.1 / 100**0.5, rel=0.04)  # four standard errors
+
+
+@pytest.mark.slow
+def test_the_first_weights_of_the_gates_of_a_memory_are_different_orthogonal_matrices():
+    gates = np.split(np.asarray(_orthogonal_gates(jax.random.key(0), 3, float)), 3, axis=1)
+    for i, gate in enumerate(gates):
+        np.testing.assert_allclose(gate @ gate.T, np.eye(3), atol=1e-12)
+        assert np.any(gate != gates[i - 1])
 
 
 QUICK = [(17, 13), (5, 3)]

@@ -37,7 +37,9 @@ def test_normal_observations_have_zero_mean_and_unit_variance_and_outliers_are_c
 
 def test_an_entry_that_never_changes_stays_finite():
     constant = jnp.ones((8, 2))
-    assert not np.any(jax.jit(lambda x: RunningStatistics.of(x).normalize(x))(constant))
+    normalized = jax.jit(lambda x, y: RunningStatistics.of(x).normalize(y))
+    assert not np.any(normalized(constant, constant))
+    np.testing.assert_allclose(normalized(constant, constant + 1e-3), 0.1)  # as if it had a deviation of 0.01
 
 
 def test_vectors_that_do_not_count_change_nothing():

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from double_integrator import SMALL, Cue
+from helpers import jit_unoptimized
 
 from jaxdrones import envs
 from jaxdrones.learning import bptt, checkpoint, collect, evaluate, ppo, shac
@@ -34,6 +35,22 @@ def test_a_recurrent_unit_keeps_what_its_bias_says():
     start = unit.init(KEY, jnp.zeros(2))
     params = jax.tree.map(lambda x: x if x.ndim == 1 else 0 * x, start)
     np.testing.assert_allclose(unit.apply(params, jnp.zeros(2), state), state / (1 + np.exp([-1.0, -2, -3])), rtol=1e-6)
+
+
+def test_a_memory_is_emptied_before_the_first_input_of_an_episode():
+    """In the first of two worlds an episode starts with the second input."""
+    unit, inputs = GRU(3), jnp.arange(12.0).reshape(3, 2, 2)
+    starts = np.array([[False, False], [True, False], [False, False]])
+
+    @jit_unoptimized
+    def states():
+        params = unit.init(KEY, inputs[0])
+        alone = unit.apply(params, inputs[1:], jnp.zeros((2, 3)), starts[2:].repeat(2, 0))
+        return unit.apply(params, inputs, jnp.ones((2, 3)), starts), alone
+
+    states, alone = states()
+    np.testing.assert_allclose(states[1:, 0], alone[:, 0], rtol=1e-6)
+    assert np.all(states[1:, 1] != alone[:, 1])
 
 
 def learnt_cost(learner, env, **changes):

@@ -11,7 +11,7 @@ from helpers import jit_unoptimized
 from jaxdrones import envs
 from jaxdrones.envs.observations import encounters, neighbors, obstacles
 from jaxdrones.learning import bptt, checkpoint
-from jaxdrones.learning.layers import SetEncoder, make_network, split_sets
+from jaxdrones.learning.layers import MLP, Network, SetEncoder, make_network, split_sets
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.sensing import Cylinder, Scene, Sphere
@@ -99,10 +99,12 @@ def test_rows_are_not_normalized_and_all_else_is(tmp_path):
     np.testing.assert_array_equal(again(obs), policy(obs))
 
 
-def test_the_statistics_of_a_policy_without_sets_are_kept():
-    policy = Policy.init(KEY, envs.make("hover"), (4,))
-    stats = RunningStatistics.of(jnp.ones((3, policy.obs_stats.mean.size)))
-    np.testing.assert_array_equal(policy.with_obs_stats(stats).obs_stats.mean, stats.mean)
+def test_the_statistics_of_a_row_are_those_of_no_observation_and_those_of_a_policy_without_sets_are_kept():
+    policy = Policy(None, RunningStatistics.empty(5), Network((4,), 1, sets=((1, 1, 3, REACH),)))
+    seen = RunningStatistics(2 + jnp.arange(5.0), 7 + jnp.arange(5.0), jnp.ones(()))
+    kept = policy.with_obs_stats(seen).obs_stats
+    np.testing.assert_array_equal([kept.mean, kept.var], [[2, 0, 0, 0, 6], [7, 1, 1, 1, 11]])
+    assert Policy(None, seen, MLP((4,), 1)).with_obs_stats(seen).obs_stats is seen
 
 
 @functools.lru_cache

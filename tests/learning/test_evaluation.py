@@ -17,7 +17,7 @@ from jaxdrones.engine.step import Step
 from jaxdrones.envs.actions import ACTIONS
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
-from jaxdrones.learning import evaluate
+from jaxdrones.learning import evaluate, evaluation
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.tasks.shaping import alive
@@ -31,6 +31,31 @@ def test_wilson_interval_against_known_numbers():
     np.testing.assert_allclose(wilson_interval(10, 100), (0.0552292, 0.1743657), atol=1e-6)
     np.testing.assert_allclose(wilson_interval(10_000, 10_000), (0.9996160, 1.0), atol=1e-6)
     np.testing.assert_allclose(wilson_interval(0, 50), (0.0, 0.0713476), atol=1e-6)
+
+
+def test_drones_of_an_episode_are_as_many_trials_as_the_variance_of_its_successes_says():
+    together, opposed = np.array([[1, 1], [0, 0]] * 5), np.array([[1, 0]] * 8 + [[1, 1], [0, 0]])
+    assert evaluation._interval(together, 10) == wilson_interval(5, 10)
+    assert evaluation._interval(opposed, 10) == wilson_interval(10, 20)
+
+
+def test_a_zero_has_no_sign_in_a_start():
+    both = [evaluation._fingerprint(jnp.array(x)) for x in (0.0, -0.0)]
+    np.testing.assert_array_equal(*both)
+
+
+def test_devices_share_only_as_many_episodes_as_they_can_share_equally(monkeypatch):
+    counts = []
+
+    def make_mesh(episodes, devices):
+        counts.append(len(devices))
+        raise InterruptedError
+
+    monkeypatch.setattr(evaluation.sharding, "make_mesh", make_mesh)
+    for episodes in (4, 5):
+        with pytest.raises(InterruptedError):
+            evaluation.compile_evaluation(LIFT, None, episodes, 2 * jax.devices())
+    assert counts == [2, 1]
 
 
 class Lift(Step):
@@ -59,7 +84,10 @@ class UntilTheEnd(PyTreeNode):
 
 
 def lift(starts=(0.0,), drones=1, noise=None, **changes):
-    """An environment of 12 steps from 1 m plus one of the offsets, which fails below 0.55 m and is done above 1.1 m."""
+    """An environment of 12 steps from 1 m plus one of the offsets, which fails below 0.55 m and is done above 1.1 m.
+
+    Above 1.05 m it is cut after 9 steps.
+    """
 
     def start(key, params):
         chosen, unused = jax.random.split(key)
@@ -79,6 +107,7 @@ def lift(starts=(0.0,), drones=1, noise=None, **changes):
             "fell": lambda task, world: world.drones.pos[:, 2] < 0.55,
             "done": lambda task, world: world.drones.pos[:, 2] > 1.1,
         },
+        truncations={"late": lambda task, world: (world.step == 9) & (world.drones.pos[:, 2] > 1.05)},
         success=lambda metrics, dt: metrics["error"][-1] < 2,
         success_terminations=("done",),
     )
@@ -97,7 +126,8 @@ def flown(before, after=0.0, env=LIFT, episodes=3):
 
 
 @pytest.mark.parametrize(
-    ("before", "succeeds", "ended", "steps"), [(-1, 0, "fell", 5), (-0.3, 1, None, 12), (1, 1, "done", 3)]
+    ("before", "succeeds", "ended", "steps"),
+    [(-1, 0, "fell", 5), (-0.3, 1, None, 12), (1, 1, "done", 3), (0.15, 0, "late", 9)],
 )
 def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succeeds, ended, steps):
     """A failure is none of the successes, though the criterion holds; nor does a later failure undo a success."""
@@ -105,7 +135,7 @@ def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succe
     assert all(report == reports[0] for report in reports)
     report = reports[0]
     assert report.success == succeeds and report.mean_return == steps
-    assert report.end_rates == {"fell": ended == "fell", "done": ended == "done"}
+    assert report.end_rates == {name: ended == name for name in ("fell", "done", "late")}
     assert report.distinct_episodes == 1 and report.success_interval is None  # all flew alike
     np.testing.assert_allclose(report.mean_length, 0.1 * steps, rtol=1e-6)
     climb = 0.1 * before * (1 if before < 0 else float(LIFT.params.max_rpm[0] / LIFT.params.hover_rpm[0]) - 1)
@@ -124,12 +154,13 @@ def test_successes_are_counted_in_episodes_or_in_drones_that_end_alone(ends, suc
     steps = 5 if ends == "team" else (5 + 12) / 2  # to the end of the team, or mean of those to the ends of the drones
     np.testing.assert_allclose([report["mean_length"], report["mean_return"]], [0.1 * steps, steps], rtol=1e-6)
     np.testing.assert_allclose(report["final_error"], 0.5 / 2, atol=1e-6)
-    assert report["end_rates"] == {"fell": 1 if ends == "team" else 0.5, "done": 0}
+    assert report["end_rates"] == {"fell": 1 if ends == "team" else 0.5, "done": 0, "late": 0}
 
 
 def test_errors_of_a_report_are_those_of_all_drones():
     """One of two drones stays at its target, and the other one climbs by as much in each of 12 steps."""
-    near = dict(success=lambda metrics, dt: metrics["error"][-1] < 1e-3, terminations={}, success_terminations=())
+    near = dict(success=lambda metrics, dt: metrics["error"][-1] < 1e-3, success_terminations=())
+    near |= dict(terminations={}, truncations={})
     report = flown(jnp.array([0.0, 0.2]), env=lift(drones=2, **near))
     assert report.success == 0  # as that of a team is that of all of it
     error = 2 * report.final_error
@@ -237,7 +268,8 @@ def test_the_start_and_the_steps_of_an_episode_draw_from_keys_of_their_own():
 
 def test_a_task_without_a_criterion_has_no_success():
     report = flown(0, env=lift(success=None))
-    assert report.success is None and report.success_interval is None
+    assert report.success is None and report.success_interval is None and report.success_lower_bound == 0
+    assert report.replace(success=0.5).success_lower_bound == 0.5  # of a single flight
 
 
 def test_episodes_must_be_a_whole_number():

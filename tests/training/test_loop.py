@@ -240,6 +240,15 @@ def test_a_budget_holds_to_a_tenth_whatever_updates_and_evaluations_take(
     assert "evaluated_return" in run.history()[-1] and run.sidecar("state")["update"] == run.report()["updates"]
 
 
+def test_the_first_updates_of_a_budget_which_are_slower_count_only_until_the_second():
+    timed = plan.TimePlan(time.perf_counter() + 100, 0)
+    timed.add_updates(1, 50.0)
+    assert timed.updates(1) <= 1 + 100 / 50
+    for made in (11, 21):
+        timed.add_updates(10, 1.0)
+        assert made + 900 < timed.updates(made) <= made + 1000
+
+
 def test_a_budget_that_is_spent_makes_one_update(trainer, tmp_path):
     loop.train(trainer, Run(tmp_path), 3, lambda *_: None, time.perf_counter() - 1)
     assert Run(tmp_path).report()["updates"] == 1

@@ -137,9 +137,17 @@ def test_a_training_stops_after_three_evaluations_in_a_row_that_reach_its_rate(r
 
 
 def test_an_evaluation_that_is_made_again_counts_once(trainer, tmp_path, monkeypatch):
-    """Ctrl-C after the evaluation of update 1, before its training state is the one to save."""
-    evaluate = trainer.evaluate
-    monkeypatch.setattr(trainer, "evaluate", lambda *of: evaluate(*of).replace(success_interval=(0.5, 1.0)))
+    """Ctrl-C after the evaluation of update 1, before its training state is the one to save.
+
+    The report is of other episodes than the evaluations.
+    """
+    evaluate, keys = trainer.evaluate, []
+
+    def scripted(policy, key):
+        keys.append(jax.random.key_data(key).tolist())
+        return evaluate(policy, key).replace(success_interval=(0.5, 1.0))
+
+    monkeypatch.setattr(trainer, "evaluate", scripted)
     monkeypatch.setattr(trainer, "recipe", dataclasses.replace(trainer.recipe, stop_at=0.3))
 
     def interrupted(update, *_):
@@ -151,6 +159,7 @@ def test_an_evaluation_that_is_made_again_counts_once(trainer, tmp_path, monkeyp
         loop.train(trainer, run, 3, lambda *_: None, loggers=[interrupted])
     loop.train(trainer, run, 3, lambda *_: None)
     assert run.report()["updates"] == 2  # with that of the untrained policy, three evaluations in a row
+    assert keys[-1] != keys[0] and keys[:-1] == keys[:1] * 4
 
 
 def test_a_resumed_training_keeps_the_highest_success_to_which_the_best_policy_is_tied(trainer, tmp_path, monkeypatch):
@@ -247,6 +256,13 @@ def test_the_first_updates_of_a_budget_which_are_slower_count_only_until_the_sec
     for made in (11, 21):
         timed.add_updates(10, 1.0)
         assert made + 900 < timed.updates(made) <= made + 1000
+
+
+def test_evaluations_of_a_budget_are_evenly_spaced_and_take_a_quarter_of_it_beside_the_first_and_the_last_two():
+    assert plan.TimePlan(0.0, 0, 2).next_evaluation(10, 3) == 5
+    timed = plan.TimePlan(time.perf_counter() + 120.5, 0, evaluation_seconds=10.0)
+    timed.add_updates(100, 100.0)
+    assert 75 < timed.updates(0) <= 80 and timed.evaluations == 3  # of 100 s, 25 for evaluations
 
 
 def test_a_budget_that_is_spent_makes_one_update(trainer, tmp_path):

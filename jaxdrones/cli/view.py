@@ -16,7 +16,7 @@ from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
 from jaxdrones.training.episode import fly_history
-from jaxdrones.visualization import films, video
+from jaxdrones.visualization import browser, films, video
 from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.show import LAYOUTS, show, show_history
 
@@ -55,10 +55,10 @@ def _view(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         if getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name} {getattr(options, name)} is given without --video FILE; give both or none")
     options.size = parse_pixels("--size", options.size, "1280x720")
-    if any(pixels % 2 for pixels in options.size):
-        raise UserError(f"--size is {options.size}; give two even numbers of pixels, for example 1280x720")
+    films.check_size("--size", options.size)
     if options.video:
-        video.check_video(options.video)
+        video.check_video(options.video, options.fps)
+        browser.needed_browser()
     if options.history:
         return _view_history(options)
     given, skipped = _flights(options.flights)

@@ -31,6 +31,18 @@ def find_browser() -> str | None:
     return next(filter(None, map(shutil.which, _PROGRAMS)), None)
 
 
+def needed_browser() -> str:
+    """Path of a Chromium or Chrome.
+
+    Raises:
+        ValueError: not found.
+    """
+    program = find_browser()
+    if program is None:
+        raise UserError(f"there is no Chromium; install it, under one of the names {', '.join(_PROGRAMS)}")
+    return program
+
+
 class Tab:
     """Page in the browser."""
 
@@ -128,9 +140,7 @@ def open_tab() -> Iterator[Tab]:
     Raises:
         ValueError: no browser.
     """
-    program = find_browser()
-    if program is None:
-        raise UserError(f"there is no Chromium; install it, under one of the names {', '.join(_PROGRAMS)}")
+    program = needed_browser()
     from_us, write = os.pipe()
     read, to_us = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:

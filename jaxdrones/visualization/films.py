@@ -5,12 +5,12 @@ import io
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from jaxdrones.arguments import Count, checked
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import Count, checked, choice
+from jaxdrones.checks import check_choice, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import video
@@ -24,6 +24,13 @@ CAMERAS = ("orbit", "follow", "board")
 """Cameras of the page."""
 FPS = 24
 SIZE = (1280, 720)
+
+
+def check_size(name: str, size: Any) -> None:
+    """Raise unless a size is width and height in pixels, both even."""
+    fits = isinstance(size, tuple) and len(size) == 2 and all(isinstance(x, int) and x > 0 == x % 2 for x in size)
+    if not fits:
+        raise UserError(f"{name} is {short_repr(size)}; give width and height, two even numbers of pixels")
 
 
 def choose_renderer(renderer: str | None, path: Path) -> str:
@@ -50,7 +57,7 @@ def film(
     title: str,
     renderer: str | None = None,
     fps: Count = FPS,
-    size: tuple[int, int] = SIZE,
+    size: Annotated[tuple[int, int], check_size] = SIZE,
     on_frame: Callable[[float], Any] = lambda share: None,
 ) -> int:
     """Write a film of a flight with colored drones, trails, targets and a clock; return its number of frames.
@@ -60,7 +67,7 @@ def film(
     with the completed fraction after every frame.
 
     Raises:
-        ValueError: a missing dependency, or no finite state in the flight.
+        ValueError: a missing dependency, an odd size, or no finite state in the flight.
         OSError: the film cannot be written.
     """
     video.check_video(path, fps)
@@ -90,7 +97,11 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
 
 @checked
 def film_page(
-    page: Page, path: Path, fps: Count = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit"
+    page: Page,
+    path: Path,
+    fps: Count = FPS,
+    size: Annotated[tuple[int, int], check_size] = SIZE,
+    camera: Annotated[str, choice("camera", CAMERAS)] = "orbit",
 ) -> int:
     """Write a film of a page, one frame per 1/fps of simulated time, in a few tenths of a second each.
 
@@ -105,7 +116,7 @@ def film_page(
         The number of frames.
 
     Raises:
-        ValueError: an unknown suffix, a package that is not installed, or no browser.
+        ValueError: an unknown suffix or camera, an odd size, a package that is not installed, or no browser.
         OSError: the film cannot be written.
     """
     video.check_video(path, fps)

@@ -151,6 +151,18 @@ def test_frames_that_no_film_can_show_in_time_are_refused(fps, says, record, tmp
             make(record, tmp_path / "film.gif", *["title"] * (make is films.film), fps=fps)
 
 
+@pytest.mark.parametrize("size", [(0, 0), (641, 360), (640,), ("a", 2)])
+def test_a_film_has_an_even_number_of_pixels_along_each_side(size, record, tmp_path):
+    for make in (films.film, films.film_page):
+        with pytest.raises(UserError, match=r"size is .*; give width and height, two even numbers of pixels"):
+            make(record, tmp_path / "film.gif", *["title"] * (make is films.film), size=size)
+
+
+def test_a_page_is_filmed_by_a_camera_that_it_has(record, tmp_path):
+    with pytest.raises(UserError, match="unknown camera 'folow'; did you mean 'follow'"):
+        films.film_page(record, tmp_path / "film.gif", camera="folow")
+
+
 GRAY = np.full((32, 48, 3), 128, np.uint8)
 
 

@@ -280,6 +280,21 @@ def test_an_option_of_a_film_is_refused_without_one(option, capsys):
     assert f"{' '.join(option)} is given without --video FILE; give both or none" in capsys.readouterr().err
 
 
+@pytest.mark.needs("PIL")
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--size", "0x0"], "--size is (0, 0); give width and height, two even numbers of pixels"),
+        (["--fps", "60"], "a GIF has at most 50 frames per second, not 60"),
+        ([], "there is no Chromium; install it"),
+    ],
+)
+def test_a_film_that_cannot_be_is_refused_before_its_flight_is_read(arguments, says, capsys, monkeypatch):
+    monkeypatch.setattr("jaxdrones.visualization.browser.find_browser", lambda: None)
+    assert main(["view", "nowhere", "--video", "film.gif", *arguments]) == 2
+    assert says in capsys.readouterr().err
+
+
 def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(record, tmp_path, capsys):
     """As `runs/compare/*` holds a figure beside the logs; but not one that is not there, a damaged log, or all."""
     for name in "one", "other":

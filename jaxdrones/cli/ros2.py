@@ -59,7 +59,8 @@ def add(commands) -> None:
     commands = parser.add_subparsers(metavar="[replay]", title="commands")
     replay = commands.add_parser("replay", help="publish the messages of a bag")
     option(replay, "bag BAG", "folder of a bag; nothing is simulated", folder)
-    option(replay, "--speed X", "real-time factor", float, 1.0, check=number(above=0))
+    text = "real-time factor (1)"  # of `ros2`, too: without a default of its own, which would replace that one
+    replay.add_argument("--speed", type=float, default=argparse.SUPPRESS, metavar="X", help=text)
     for name in ("--json", "--debug"):  # as before `replay`
         replay.add_argument(name, action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     replay.set_defaults(run=functools.partial(_replay, parser))

@@ -61,6 +61,7 @@ def test_a_landing_is_reported_as_json(wire, capsys):
         (["--controller", "none"], "unknown controller 'none'"),
         (["--lockstep", "--real-time"], "not allowed with"),
         (["replay", "nothing"], "nothing is not a ROS 2 bag"),
+        (["replay", "nothing", "--speed", "0"], "speed is 0.0"),
         (["--lockstep", "replay", "nothing"], "--lockstep is an option of flights"),
     ],
 )

@@ -8,6 +8,7 @@ from jaxdrones.cli.options import Once, add_drones, add_output, option, switch
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
 from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import given_settings
+from jaxdrones.errors import UserError
 from jaxdrones.export import TARGETS, save
 
 
@@ -29,9 +30,11 @@ def add(commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
+    own = is_user_policy(options.policy)
+    if options.drones is not None and not own:
+        raise UserError(f"--drones is given beside the run {options.policy}, which determines it; leave it out")
     run = open_policy(options.policy, options.task, options.realistic, given_settings(options), options.last)
     recipe, title, make_policy, _ = policy_of(run, options)
-    own = is_user_policy(options.policy)
     place = run_folder(options.task, "/export") if own else output_folder(options.policy, "export")
     with recipe.env() as env:
         exported = save(make_policy(env), env, options.to, options.output or place, options.name, title)

@@ -234,6 +234,7 @@ def test_a_damaged_run_is_one_line(file, content, message, run, tmp_path, capsys
         (["RUN", "--to", "c", "--to", "js"], "argument --to: c and js are given; give one"),
         (["RUN", "--to", "onxx"], "unknown target 'onxx'; did you mean 'onnx'"),
         (["RUN", "--to", "c", "--task", "hover"], "--task is given beside the run"),
+        (["RUN", "--to", "c", "--drones", "2"], "--drones is given beside the run"),
         (["missing", "--to", "c"], "best.json does not exist"),
         (["RUN", "--to", "c", "--output", "RUN/best.json"], "best.json: "),
         (["mine.py:policy", "--to", "c"], "--task is missing"),

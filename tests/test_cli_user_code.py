@@ -149,6 +149,15 @@ def test_a_user_policy_of_a_wrong_shape_is_refused(here, capsys):
     assert "my_policy.py:policy returns an array (1, 2) of float32; return actions of shape (1, 4)" in said
 
 
+def test_a_least_success_of_a_task_without_a_criterion_is_refused_before_the_evaluation(here, capsys, monkeypatch):
+    monkeypatch.setattr("jaxdrones.cli.evaluate.evaluate", lambda *_: pytest.fail("evaluated"))
+    command = ["eval", "my_policy.py:policy", "--task", "fly-through-gate", "--fail-below", "0.9"]
+    assert main(command) == 2
+    assert (
+        "--fail-below 0.9 is given, and the task has no criterion of success; leave it out" in capsys.readouterr().err
+    )
+
+
 def test_an_evaluation_that_is_not_finite_fails(here, capsys, monkeypatch):
     nan = float("nan")
     errors, metrics = dict.fromkeys((50, 95, 99), nan), {"error": nan, "speed": nan}

@@ -49,9 +49,11 @@ def _evaluate(options: argparse.Namespace) -> int:
     title += f", on the {options.backend} backend" * (options.backend != "explicit")
     key = jax.random.key(_FIRST_SEED + options.seed)
     with recipe.env(backend=options.backend, **team) as env:
+        if options.fail_below is not None and env.task.success is None:
+            raise UserError(
+                f"--fail-below {options.fail_below:g} is given, and the task has no criterion of success; leave it out"
+            )
         report = report_as_dict(evaluate(env, make_policy(env), key, options.episodes))
-    if options.fail_below is not None and report["success"] is None:
-        raise UserError(f"--fail-below {options.fail_below} is given, and the task has no criterion of success")
     print_results(options, about | {"recipe": recipe.as_dict(), "evaluation": report}, title, evaluation_table(report))
     if not math.isfinite(report["mean_return"]):
         what = "the mean return is not finite, so actions, states or rewards are not"

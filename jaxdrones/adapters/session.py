@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxdrones.adapters import pictures
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.arguments import checked, choice
-from jaxdrones.checks import UnexpectedKeyword
+from jaxdrones.checks import UnexpectedKeyword, check_whole
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task, World
@@ -75,6 +75,7 @@ class TeamEpisodes:
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Start an episode; a seed makes it and the following ones reproducible. There are no options."""
         if seed is not None:
+            check_whole("seed", seed, 0)
             self._seeds = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
         self._obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)

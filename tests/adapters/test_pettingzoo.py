@@ -65,6 +65,9 @@ def test_mistakes_are_named(env_of):
         env.step({"drone_0": np.zeros(4), "drone_1": np.full(4, np.nan)})
     with pytest.raises(ValueError, match="action of drone_1 is not finite"):
         env.step({"drone_0": np.zeros(4), "drone_1": jnp.full(4, jnp.nan)})
+    for wrong in -1, 1.5:
+        with pytest.raises(ValueError, match=f"^seed is {wrong}; give a whole number of at least 0$"):
+            env.reset(seed=wrong)
     with pytest.raises(TypeError, match="unexpected keyword argument 'color'"):
         parallel_env("leader-follower", color="red")
 

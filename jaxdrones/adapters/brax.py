@@ -23,8 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxdrones import envs
-from jaxdrones.adapters.session import rewarding
+from jaxdrones.adapters.session import TaskOrEnv, as_env, rewarding
 from jaxdrones.arguments import Count, checked
 from jaxdrones.errors import UserError, needs
 
@@ -47,9 +46,12 @@ class BraxEnv(base.Env):
     of all drones as channels.
     """
 
-    def __init__(self, env: envs.Env, *, team_reward: str = "sum"):
-        """Wrap an environment; the reward of a team is the `sum` or the `mean` of the rewards of its drones."""
-        self.env, self._rewarding = env, rewarding(team_reward)
+    def __init__(self, env: TaskOrEnv, *, team_reward: str = "sum"):
+        """Wrap an environment, or a task as for `jaxdrones.make`.
+
+        The reward of a team is the `sum` or the `mean` of the rewards of its drones.
+        """
+        self.env, self._rewarding = as_env(env, {}), rewarding(team_reward)
 
     @property
     def observation_size(self) -> Any:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from jaxdrones import envs
 from jaxdrones.adapters import jax_spaces
 from jaxdrones.adapters.jax_spaces import Spaces, action_space, of_gymnasium
-from jaxdrones.adapters.session import rewarding
+from jaxdrones.adapters.session import TaskOrEnv, as_env, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.episode import RESET
@@ -51,7 +51,7 @@ class GymnaxEnv:
 
     def __init__(
         self,
-        env: envs.Env,
+        env: TaskOrEnv,
         *,
         separate_truncation: bool = False,
         discrete_actions: ArrayLike | None = None,
@@ -61,7 +61,7 @@ class GymnaxEnv:
         """Wrap an environment.
 
         Args:
-            env: environment.
+            env: environment, or a task as for `jaxdrones.make`.
             separate_truncation: whether `step` returns `terminated` and `truncated`, as in gymnax 1.0, in place of
                 `done`.
             discrete_actions: (k, n a) table of actions of the whole team for discrete actions; by default actions are
@@ -73,7 +73,8 @@ class GymnaxEnv:
         Raises:
             ValueError: a table of actions of another shape, or with numbers that are not finite.
         """
-        self.env, self._rewarding = env, rewarding(team_reward)
+        self.env = env = as_env(env, {})
+        self._rewarding = rewarding(team_reward)
         self._separate_truncation = separate_truncation
         self._layout = Layout(env, None)
         self._table, self._action_space = action_space(discrete_actions, env.drones * env.action_size, spaces)

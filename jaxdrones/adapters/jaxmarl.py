@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from jaxdrones import envs
 from jaxdrones.adapters import jax_spaces
 from jaxdrones.adapters.jax_spaces import Spaces, action_space, of_gymnasium
+from jaxdrones.adapters.session import TaskOrEnv, as_env
 from jaxdrones.adapters.spaces import Layout, observation_of_drone
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.vision import observation
@@ -36,7 +37,7 @@ class JaxMARLEnv:
 
     def __init__(
         self,
-        env: envs.Env,
+        env: TaskOrEnv,
         *,
         world_state: bool = False,
         discrete_actions: ArrayLike | None = None,
@@ -45,7 +46,7 @@ class JaxMARLEnv:
         """Wrap an environment.
 
         Args:
-            env: environment.
+            env: environment, or a task as for `jaxdrones.make`.
             world_state: whether observations also have `world_state` (n, n d), a row for the centralized critic of
                 every agent: its own observation, then those of the others, without images.
             discrete_actions: (k, a) table of actions of a drone for discrete actions; by default actions are
@@ -56,7 +57,7 @@ class JaxMARLEnv:
         Raises:
             ValueError: a table of actions of another shape, or with numbers that are not finite.
         """
-        self.env = env
+        self.env = env = as_env(env, {})
         self.num_agents = env.drones
         self.agents = [f"drone_{i}" for i in range(env.drones)]
         self.agent_classes = {"drones": self.agents}

@@ -194,6 +194,12 @@ def test_a_team_acts_and_sees_as_one(env_of):
     assert (env.observation_size, env.action_size) == (2 * plain.observation_size, 2 * plain.action_size)
 
 
+def test_the_name_of_a_task_is_an_environment():
+    assert brax.wrap("hover").env.task.name == "hover"
+    with pytest.raises(ValueError, match="unknown task 'hoover'"):
+        brax.wrap("hoover")
+
+
 def test_arguments_that_the_environment_takes_instead_are_refused(env_of):
     env = brax.wrap(env_of("hover"))
     with pytest.raises(ValueError, match="action_repeat is 2"):

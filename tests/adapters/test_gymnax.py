@@ -126,6 +126,13 @@ def test_a_discrete_action_is_a_row_of_the_table(env_of):
         gymnax.wrap(plain, discrete_actions=np.full((1, 8), np.nan))
 
 
+@pytest.mark.parametrize("wrap", [gymnax.wrap, jaxmarl.wrap])
+def test_the_name_of_a_task_is_an_environment(wrap):
+    assert wrap("hover").env.task.name == "hover"
+    with pytest.raises(ValueError, match="unknown task 'hoover'"):
+        wrap("hoover")
+
+
 def test_samples_are_in_their_spaces(env_of):
     env = gymnax.wrap(env_of("hover", drones=2, duration=0.02))
     obs, _ = env.reset(KEY)

@@ -15,7 +15,8 @@ from benchmarks import exported
 from benchmarks.export import flown as flown_by
 from benchmarks.export import one_call
 from jaxdrones.envs.observations import encounters
-from jaxdrones.export import save
+from jaxdrones.export import layers, save
+from jaxdrones.export.text import number
 from jaxdrones.learning import bptt, evaluate
 from jaxdrones.training.presets import preset
 
@@ -87,6 +88,13 @@ def test_drones_with_their_own_networks_have_a_file_each(to, tmp_path):
         assert difference(actions, np.asarray(both[..., 1 - i, :])) > DIFFERENT
 
 
+def test_a_drone_with_its_own_network_has_its_own_weights(tmp_path):
+    policy = exported.random_policy(made("team")[0], per_agent=True)
+    headers = [one.files[0].read_text() for one in save(policy, made("team")[0], "c", tmp_path)]
+    of_drones = jax.tree.leaves(policy.params)[0][:, 0]
+    assert [[number(x) in header for x in of_drones] for header in headers] == [[True, False], [False, True]]
+
+
 def test_networks_of_other_drones_than_those_of_the_environment_are_refused(tmp_path):
     policy = exported.random_policy(made("team")[0], per_agent=True)
     with pytest.raises(ValueError, match="a network for each of 2 drones, and leader-follower has 3"):
@@ -115,6 +123,16 @@ def test_what_is_exported_acts_as_the_policy_in_flight(to, tmp_path):
     (one,) = save(policy, env, to, tmp_path)
     actions = exported.RUN[to](one.files[0], inputs)
     assert difference(actions, exported.expected_actions(policy, inputs)) < TOLERANCE
+
+
+def test_the_smaller_half_of_a_margin_is_above_and_left():
+    image, output = layers.Tensor("image", (26, 21, 3)), layers.Tensor("features", (7, 6, 8))
+    assert layers.Convolution((image,), output, stride=4).margin == ((1, 1), (1, 2))
+
+
+def test_a_sum_of_rows_multiplies_every_feature_of_every_row():
+    features, rows = layers.Tensor("features", (5, 8)), layers.Tensor("rows", (5, 6))
+    assert layers.SumOfRows((features, rows), layers.Tensor("sum", (8,))).multiply_adds == 5 * 8
 
 
 MISTAKES = [  # kind of policy, and what is written in place of what

@@ -297,18 +297,37 @@ def test_numbers_that_are_not_finite_are_numbers_of_javascript():
 
 
 @pytest.mark.parametrize(
-    ("task", "reason"),
+    ("task", "options", "reason"),
     [
-        ("sling", "it has a load or another model"),
-        pytest.param("tracking", "its target moves", marks=pytest.mark.slow),
-        pytest.param("gates", "its target moves", marks=pytest.mark.slow),
+        ("sling", {}, "it has a load or another model"),
+        ("hover", {"delay": (0.0, 0.02)}, "its commands are delayed"),
+        pytest.param("tracking", {}, "its target moves", marks=pytest.mark.slow),
+        pytest.param("gates", {}, "its target moves", marks=pytest.mark.slow),
     ],
 )
-def test_a_page_of_a_task_that_it_does_not_simulate_is_refused(task, reason):
+def test_a_page_of_a_task_that_it_does_not_simulate_is_refused(task, options, reason):
     from jaxdrones.export.simulation import _check
 
     with pytest.raises(ValueError, match=reason):
-        _check(lambda obs: jnp.zeros((1, 4)), jd.make(task))
+        _check(lambda obs: jnp.zeros((1, 4)), jd.make(task, **options))
+
+
+def test_controllers_of_a_page_command_at_240_hz_drones_that_hover_at_first_in_a_square(env, monkeypatch):
+    from jaxdrones.export import simulation
+
+    periods = []
+    monkeypatch.setattr(simulation, "_check", lambda *_: None)
+    monkeypatch.setattr(simulation, "_policy", lambda *_: (None, 1, (), ()))
+    monkeypatch.setattr(simulation, "_controller", lambda name, params, dt: periods.append(dt))
+    monkeypatch.setattr(simulation, "javascript", lambda *_, **__: "")
+    made = simulation.simulation(None, env, drones=7)
+    np.testing.assert_allclose(periods, [pilot.period * made.dt for pilot in made.pilots[1:]])
+    np.testing.assert_allclose(periods, 1 / 240, rtol=0, atol=made.dt / 2)
+    np.testing.assert_allclose(made.state[-4:], env.params.hover_rpm[0])
+    goals = np.array(made.goals)
+    np.testing.assert_allclose(goals[:, 2], 1)
+    np.testing.assert_allclose(goals[:, :2].mean(axis=0), 0, atol=1e-12)
+    assert len(np.unique(goals.round(9), axis=0)) == 7 and (np.ptp(goals[:, :2], axis=0) < 1.3).all()
 
 
 @pytest.mark.parametrize("case", ["still", "touched", *[(axis, sign) for axis in range(3) for sign in (1, -1)], 4.9])
@@ -346,7 +365,8 @@ def test_the_policy_of_a_page_flies_without_the_disturbance_of_its_environment(e
     windy = dataclasses.replace(env, disturbance=jd.dryden(7.7))
     world = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(env.reset, jax.random.key(0))[1])
     monkeypatch.setattr(type(windy), "reset", lambda *_: (None, world))
-    fly, _, gains, memory = simulation._policy(lambda obs: jnp.zeros((1, 4)), windy)
+    fly, period, gains, memory = simulation._policy(lambda obs: jnp.zeros((1, 4)), windy)
+    assert period == windy.physics.substeps
     state = jax.tree.map(lambda x: x[0], world.drones)
     assert jax.eval_shape(fly, gains, memory, state, jnp.zeros(3))[1].shape == (4,)
 

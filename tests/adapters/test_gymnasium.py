@@ -1,4 +1,5 @@
 import functools
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -11,6 +12,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from helpers import mostly_slow
 
 from jaxdrones.adapters.gymnasium import GymnasiumEnv, VectorEnv, ids
+from jaxdrones.adapters.session import as_numpy
 from jaxdrones.envs import TASKS
 
 pytestmark = pytest.mark.float32
@@ -95,6 +97,7 @@ def test_a_seed_fixes_the_episode_and_those_that_follow(env_of):
     starts = [[env.reset(seed=5)[0], env.reset()[0], env.reset()[0]] for env in (first, second)]
     np.testing.assert_array_equal(*starts)
     assert not np.array_equal(starts[0][0], starts[0][1]) and not np.array_equal(starts[0][1], starts[0][2])
+    np.testing.assert_array_equal(first.reset(seed=0)[0], first.reset(seed=0)[0])
 
 
 def test_an_episode_is_cut_at_its_time_limit_and_then_needs_a_reset(env_of):
@@ -102,9 +105,12 @@ def test_an_episode_is_cut_at_its_time_limit_and_then_needs_a_reset(env_of):
     with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
         env.step(np.zeros(4))
     env.reset(seed=0)
+    assert env.metadata["render_fps"] == 100
     for _ in range(4):
         assert env.step(np.zeros(4))[2:4] == (False, False)
-    assert env.step(np.zeros(4))[2:4] == (False, True)
+    *_, terminated, truncated, info = env.step(np.zeros(4))
+    assert (terminated, truncated) == (False, True)
+    assert {type(x) for x in info.values()} == {float, bool}  # of the only drone
     with pytest.raises(gymnasium.error.ResetNeeded, match="after the end"):
         env.step(np.zeros(4))
 
@@ -261,6 +267,44 @@ def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of
     for _ in range(5):
         truncated = envs.step(np.zeros((3, 4)))[3]
     assert truncated.all()
+
+
+def test_real_numbers_are_of_single_precision_and_others_as_they_were():
+    types = [x.dtype for x in as_numpy((np.zeros(2), np.zeros(2, np.uint8), np.zeros(2, bool)))]
+    assert types == [np.float32, np.uint8, bool]
+
+
+def test_a_time_limit_is_that_of_the_adapter_alone(env_of):
+    env = short(env_of)
+    assert VectorEnv(env, 2, max_episode_steps=2).env.steps == 2 and env.steps == 5
+
+
+def test_seeds_count_on_from_the_first_and_begin_again_after_32_bits(env_of):
+    seeds, _ = without_worlds(VectorEnv(short(env_of), 3)).reset(seed=2**32 - 1)
+    assert seeds.tolist() == [2**32 - 1, 0, 1]
+
+
+def test_a_world_that_ended_needs_a_reset_until_a_mask_resets_it(env_of):
+    envs = without_worlds(VectorEnv(short(env_of), 3, autoreset_mode="Disabled"))
+    envs._over[:] = True
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"worlds \[1\] have ended"):
+        envs.step(np.zeros((3, 4)))
+
+
+def test_final_observations_and_infos_are_those_of_the_worlds_that_ended(env_of):
+    envs, ended, error = VectorEnv(short(env_of), 3), np.array([True, False, False]), np.arange(3.0)
+    info = {"last": {"error": error}, "not_reset": ~ended, "final_obs": error, "episode": {"r": error}}
+    infos = envs._infos(info, ended)
+    assert infos["_final_obs"] is infos["_final_info"] is infos["final_info"]["_error"] is ended
+    assert infos["_error"].tolist() == [False, True, True] and infos["final_info"]["episode"]["_r"] is ended
+    assert "final_obs" not in envs._infos(info, np.zeros(3, bool))
+
+
+def without_worlds(envs):
+    """Many worlds that are not simulated: their observations are their seeds."""
+    envs._worlds = SimpleNamespace(started=True, reset=lambda seeds, mask: seeds)
+    return envs
 
 
 def test_a_list_of_seeds_is_one_for_every_world(vector_of):

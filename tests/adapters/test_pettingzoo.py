@@ -10,7 +10,7 @@ pytest.importorskip("pettingzoo")
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from jaxdrones.adapters.pettingzoo import parallel_env
-from jaxdrones.adapters.session import TeamEpisodes, _advance
+from jaxdrones.adapters.session import TeamEpisodes, _advance, begin
 from jaxdrones.envs import TASKS
 
 pytestmark = pytest.mark.float32
@@ -48,6 +48,8 @@ def test_the_state_is_what_all_agents_see(env_of):
     obs, _ = env.reset(seed=0)
     np.testing.assert_array_equal(env.state(), np.concatenate([obs["drone_0"], obs["drone_1"]]))
     assert env.state() in env.state_space
+    starts = [env.reset(seed) and env.reset()[0]["drone_0"] for seed in (3, 3, 4)]  # of the episode after it
+    assert np.array_equal(starts[0], starts[1]) and not np.array_equal(starts[0], starts[2])
 
 
 def test_mistakes_are_named(env_of):
@@ -83,12 +85,17 @@ def test_an_agent_leaves_when_it_is_terminated_or_cut():
     agents._layout = SimpleNamespace(
         gather_present=lambda actions, present: None, arrange=lambda obs: dict.fromkeys(names, 0)
     )
-    for flying in names, ["drone_2"]:
+    for flying, flags in (names, ended), (["drone_2"], dict(terminated=no[2:], truncated=no[2:])):
         assert agents.agents == flying
-        assert all(list(part) == flying for part in agents._step({})[0])
+        results = agents._step({})[0]
+        assert all(list(part) == flying for part in results)
+        for found, flag in zip(results[2:], flags.values(), strict=True):
+            assert list(found.values()) == flag.tolist()
 
 
 def test_every_step_of_an_episode_has_a_key_of_its_own():
     env = SimpleNamespace(step=lambda key, world, action: (jax.random.key_data(key).tolist(), world))
     first, second = (_advance(env, jax.random.key(0), SimpleNamespace(step=k), None)[1][0] for k in range(2))
     assert first != second
+    key, start, _ = begin(SimpleNamespace(reset=lambda key: (None, key)), 0)  # which is not that of the start
+    assert key.tolist() != start.tolist()

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import jit_unoptimized
+from viewer_payload import decode
 
 import jaxdrones as jd
 from jaxdrones.visualization import browser
@@ -328,6 +329,17 @@ def test_controllers_of_a_page_command_at_240_hz_drones_that_hover_at_first_in_a
     np.testing.assert_allclose(goals[:, 2], 1)
     np.testing.assert_allclose(goals[:, :2].mean(axis=0), 0, atol=1e-12)
     assert len(np.unique(goals.round(9), axis=0)) == 7 and (np.ptp(goals[:, :2], axis=0) < 1.3).all()
+
+
+def test_drones_of_a_page_begin_at_their_goals_which_it_shows(env, monkeypatch):
+    from jaxdrones.export import simulation
+
+    start = [0.5, 0, 1, 0, 0, 0, 1, *np.zeros(10)]
+    made = simulation.Simulation("", (), start, [[0.5, 0, 1], [-0.5, 0, 1]], 0.03, 0.005)
+    monkeypatch.setattr(simulation, "simulation", lambda *_: made)
+    (world,) = decode(simulation.page(None, env, "two", drones=2).payload)["worlds"]
+    np.testing.assert_allclose(world["targets"], [made.goals], atol=1e-4)
+    np.testing.assert_allclose(world["pos"], [made.goals], atol=1e-4)
 
 
 @pytest.mark.parametrize("case", ["still", "touched", *[(axis, sign) for axis in range(3) for sign in (1, -1)], 4.9])

@@ -77,7 +77,7 @@ class Layout:
         """`gather` for the agents that are still in the world; actions of the others are zero."""
         if isinstance(actions, Mapping):
             left = [name for name in self.names if name not in present]
-            actions = dict.fromkeys(left, np.zeros(self.size, np.float32)) | dict(actions)
+            actions = dict(actions) | dict.fromkeys(left, np.zeros(self.size, np.float32))
         return self.gather(actions)
 
 

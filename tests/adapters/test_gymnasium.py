@@ -13,6 +13,7 @@ from helpers import mostly_slow
 
 from jaxdrones.adapters.gymnasium import GymnasiumEnv, VectorEnv, ids
 from jaxdrones.adapters.session import as_numpy
+from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import TASKS
 
 pytestmark = pytest.mark.float32
@@ -106,6 +107,7 @@ def test_an_episode_is_cut_at_its_time_limit_and_then_needs_a_reset(env_of):
         env.step(np.zeros(4))
     env.reset(seed=0)
     assert env.metadata["render_fps"] == 100
+    assert env.action_space.low.tolist() == [-1] * 4 and env.action_space.high.tolist() == [1] * 4
     for _ in range(4):
         assert env.step(np.zeros(4))[2:4] == (False, False)
     *_, terminated, truncated, info = env.step(np.zeros(4))
@@ -243,6 +245,7 @@ def test_a_world_that_a_mask_resets_is_not_reset_again_by_the_next_step(env_of):
     start, _ = envs.reset(options={"reset_mask": np.array([True, False])})
     obs, reward, terminated, truncated, infos = envs.step(np.zeros((2, 4)))
     assert (reward != 0).tolist() == infos["_reward_position"].tolist() == [True, False]
+    assert infos["reward_position"].shape == (2,)  # of the only drone of each world
     assert not terminated.any() and not truncated.any()
     assert np.abs(obs[0] - start[0]).max() < 0.2 < np.abs(obs[1] - start[1]).max()
 
@@ -272,6 +275,38 @@ def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of
 def test_real_numbers_are_of_single_precision_and_others_as_they_were():
     types = [x.dtype for x in as_numpy((np.zeros(2), np.zeros(2, np.uint8), np.zeros(2, bool)))]
     assert types == [np.float32, np.uint8, bool]
+
+
+def test_actions_by_drone_have_the_drones_after_the_worlds(env_of):
+    layout = Layout(env_of("leader-follower"), ["a", "b"])
+    actions = layout.gather({"a": np.zeros((3, 1)), "b": np.ones((3, 1))}, (3,))
+    np.testing.assert_array_equal(actions, np.tile([[0], [1]], (3, 1, 1)))
+    left = layout.gather_present({"a": np.ones(1), "b": np.full(1, np.nan)}, ["a"])  # whatever is given to b
+    np.testing.assert_array_equal(left, [[1], [0]])
+
+
+class Keys:
+    """Episodes of two drones, of two steps each, that observe the key of a step."""
+
+    def reset(self, key):
+        return key.astype(jnp.float32)[:, None], jnp.zeros((), int)
+
+    def step(self, key, age, action):
+        obs, _ = self.reset(key)
+        reward = jnp.array([1.0, 2.0])
+        info = {"rewards": {"a": reward}, "metrics": {}, "terminations": {}, "truncations": {}}
+        info |= {"final_obs": obs, "episode": {"return": 2 * reward, "length": age + 1}}
+        return obs, 1 - age, reward, jnp.zeros((), bool), age == 1, info
+
+
+def test_every_step_has_a_key_of_its_own_and_the_last_one_of_an_episode_the_return_of_the_team(env_of):
+    envs = VectorEnv(env_of("hover", drones=2, duration=0.02), 2)
+    envs._worlds._episodes = Keys()
+    start, _ = envs.reset(seed=0)
+    (first, reward, *_, info), (second, *_, ended, infos) = (envs.step(np.zeros((2, 2, 4))) for _ in range(2))
+    assert len(np.unique(np.concatenate([start, first, second]), axis=0)) == 6
+    assert reward.tolist() == [3, 3] and ended.all() and infos["final_info"]["episode"]["r"].tolist() == [6, 6]
+    assert info["_reward_a"].all() and not infos["_reward_a"].any() and infos["_final_info"].all()
 
 
 def test_a_time_limit_is_that_of_the_adapter_alone(env_of):

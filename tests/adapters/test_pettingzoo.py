@@ -48,6 +48,10 @@ def test_the_state_is_what_all_agents_see(env_of):
     obs, _ = env.reset(seed=0)
     np.testing.assert_array_equal(env.state(), np.concatenate([obs["drone_0"], obs["drone_1"]]))
     assert env.state() in env.state_space
+    env.state()[:] = 0  # a copy
+    np.testing.assert_array_equal(env.state()[-22:], obs["drone_1"])
+    bounds = [env.observation_space(agent).high for agent in env.agents]
+    np.testing.assert_array_equal(env.state_space.high, np.concatenate(bounds))
     starts = [env.reset(seed) and env.reset()[0]["drone_0"] for seed in (3, 3, 4)]  # of the episode after it
     assert np.array_equal(starts[0], starts[1]) and not np.array_equal(starts[0], starts[2])
 

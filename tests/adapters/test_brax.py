@@ -3,6 +3,7 @@ import dataclasses
 import functools
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -107,8 +108,43 @@ def test_a_team_whose_drones_end_alone_goes_on_until_its_last_is_cut():
     assert not np.any(after[-1].pipeline_state[0].active) and max(x.metrics["error"] for x in after) < 10
 
 
+@pytest.mark.parametrize(
+    ("ends", "terminated", "cut", "active", "done", "time_out"),
+    [
+        ("team", [0, 0], [0, 0], [1, 1], 0, 0),
+        ("team", [1, 0], [0, 0], [1, 0], 1, 0),
+        ("team", [0, 0], [0, 1], [1, 0], 1, 1),
+        ("team", [1, 0], [0, 1], [1, 0], 1, 0),
+        ("drone", [1, 0], [0, 0], [0, 1], 0, 0),
+        ("drone", [0, 0], [1, 1], [0, 0], 1, 1),
+        ("drone", [1, 1], [1, 0], [0, 0], 1, 0),
+    ],
+)
+def test_a_time_out_is_a_cut_without_a_termination(ends, terminated, cut, active, done, time_out, env_of):
+    """Of any drone of a team, or of the last of drones that end one by one; those that left have no metrics."""
+    terminated, cut, active = (np.array(x, bool) for x in (terminated, cut, active))
+    info = {"terminated": terminated, "truncations": {"cut": cut}, "rewards": {}, "active": active}
+    info["metrics"] = {"error": jnp.array([2.0, 2.0]) / active}
+    outcome = np.zeros((2, 1)), SimpleNamespace(active=active), jnp.zeros(2), terminated.any(), None, info
+    env, keys = brax.wrap(env_of("hover")), []
+    task = SimpleNamespace(ends=ends)
+    step = lambda key, world, action: keys.append(key.tolist()) or outcome  # noqa: E731
+    env.env = SimpleNamespace(drones=2, action_size=1, task=task, step=step)
+    for k in range(2):
+        place = SimpleNamespace(step=k), jax.random.PRNGKey(0)
+        state = env.step(brax.base.State(place, 0, 0, 0, {}, {}), jnp.zeros(2))
+    assert keys[0] != keys[1]
+    assert (state.done, state.info["time_out"]) == (done, time_out)
+    assert state.metrics["error"] == (2 if active.any() else 0)
+
+
+def test_the_drones_of_a_team_follow_each_other_in_the_channels_of_an_image():
+    images = jnp.arange(6).reshape(2, 1, 1, 3)
+    np.testing.assert_array_equal(brax._channels(images), [[range(6)]])
+
+
 class Counting:
-    """An environment whose reward is the number of steps, and which terminates after three where the action is 1."""
+    """An environment whose reward is the number of steps, and which terminates where that times the action is 3."""
 
     def reset(self, rng):
         zero = jnp.zeros((), jnp.float32)
@@ -124,18 +160,20 @@ class Counting:
 
 def test_steps_and_sums_begin_anew_with_every_episode():
     wrapped = brax._Training(Counting(), 4)
-    state, seen = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), 2)), []
+    state, seen = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), 3)), []
+    first = state.pipeline_state[1]
     for _ in range(8):
-        state = wrapped.step(state, jnp.array([0.0, 1.0]))
+        state = wrapped.step(state, jnp.array([0.0, 1.0, 0.75]))
         info = state.info | state.info["episode_metrics"]
         seen.append([info["steps"], state.done, info["truncation"], info["sum_reward"], info["length"], state.obs])
     steps, done, truncation, sums, length, obs = np.array(seen).transpose(1, 2, 0)
-    np.testing.assert_array_equal(steps, [[1, 2, 3, 4] * 2, [1, 2, 3, 1, 2, 3, 1, 2]])
+    np.testing.assert_array_equal(steps, [[1, 2, 3, 4] * 2, [1, 2, 3, 1, 2, 3, 1, 2], [1, 2, 3, 4] * 2])
     np.testing.assert_array_equal(length, steps)
-    np.testing.assert_array_equal(done, steps == [[4], [3]])
-    np.testing.assert_array_equal(truncation, done * [[1], [0]])
+    np.testing.assert_array_equal(done, steps == [[4], [3], [4]])
+    np.testing.assert_array_equal(truncation, done * [[1], [0], [0]])  # the last one terminates at its limit
     np.testing.assert_array_equal(sums, steps * (steps + 1) / 2)
     np.testing.assert_array_equal(obs, np.where(done, 0, steps))
+    assert (state.pipeline_state[1] != first).any(axis=1).all()  # the keys of the next episodes
 
 
 @pytest.mark.slow

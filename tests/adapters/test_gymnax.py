@@ -133,6 +133,61 @@ def test_the_name_of_a_task_is_an_environment(wrap):
         wrap("hoover")
 
 
+class Ends:
+    """Episodes of a drone that end as their state says: whether they are terminated, and truncated."""
+
+    def __init__(self, env):
+        pass
+
+    def reset(self, key):
+        return jnp.ones((1, 2)), jnp.zeros(2, bool)
+
+    def step_without_reset(self, key, state, action):
+        return jnp.zeros((1, 2)), state, jnp.ones(1), state[0], state[1], {"final_obs": jnp.zeros((1, 2))}
+
+    step = step_without_reset
+
+
+@pytest.mark.parametrize("ends", [(False, False), (True, False), (False, True)])
+def test_only_a_termination_has_no_discount_and_each_end_begins_an_episode(ends, env_of, monkeypatch):
+    plain = env_of("hover", duration=0.02)
+    monkeypatch.setattr(gymnax.envs, "AutoReset", Ends)
+    env, separate = gymnax.wrap(plain), gymnax.wrap(plain, separate_truncation=True)
+    state, action = jnp.array(ends), jnp.zeros(4)
+    for step in env.step, env.step_env:
+        *_, done, info = step(KEY, state, action)
+        assert (done, info["discount"]) == (any(ends), not ends[0])
+    *_, terminated, truncated, _ = separate.step(KEY, state, action)
+    *_, of_step_env, info = separate.step_env(KEY, state, action)
+    assert (terminated, truncated) == (of_step_env, info["truncated"]) == ends
+    obs, after, *_ = env.step(KEY, state, action, env.default_params)
+    assert obs.tolist() == [any(ends)] * 2 and not after.any()
+
+
+def test_params_are_the_vehicle_and_the_time_limit(env_of):
+    env = gymnax.wrap(env_of("hover", duration=0.02))
+    other = env.env.params.replace(mass=2 * env.env.params.mass)
+    made = env._with(gymnax.EnvParams(3, other))
+    assert made.steps == 3 and made.params is other
+
+
+def test_a_number_chooses_a_row_of_the_table(env_of):
+    plain, table = env_of("hover", drones=2, duration=0.02), np.linspace(-1, 1, 24).reshape(3, 8)
+    env = gymnax.wrap(plain, discrete_actions=table)
+    np.testing.assert_allclose(env._gathered(2), table[2].reshape(2, 4), rtol=1e-6)
+    of_drones = jaxmarl.wrap(plain, discrete_actions=table[:, :4])
+    assert of_drones.get_avail_actions(None)["drone_1"].tolist() == [1, 1, 1]
+
+
+def test_numbers_of_actions_are_from_0_and_samples_of_equal_spaces_differ():
+    three = jax_spaces.Discrete(3)
+    drawn = jax.vmap(three.sample)(jax.random.split(KEY, 50))
+    assert set(drawn.tolist()) == {0, 1, 2} and three.contains(drawn).all() and not three.contains(3)
+    box = jax_spaces.Box(-1.0, 1.0, ())
+    sample = jax_spaces.Dict({"a": box, "b": box}).sample(KEY)
+    assert sample["a"] != sample["b"]
+
+
 def test_samples_are_in_their_spaces(env_of):
     env = gymnax.wrap(env_of("hover", drones=2, duration=0.02))
     obs, _ = env.reset(KEY)

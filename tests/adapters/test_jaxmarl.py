@@ -50,11 +50,11 @@ def test_it_is_the_environment_with_autoreset(env_of):
 
 
 def test_the_world_state_of_an_agent_starts_with_its_own_observation(env_of):
-    obs, _ = jaxmarl.wrap(env_of("hover", drones=2, duration=0.02), world_state=True).reset(KEY)
-    first, second = obs["drone_0"], obs["drone_1"]
-    np.testing.assert_array_equal(
-        obs["world_state"], [np.concatenate([first, second]), np.concatenate([second, first])]
-    )
+    """Those of the others follow in their order."""
+    env = jaxmarl.wrap(env_of("hover", drones=3), world_state=True)
+    obs = env._by_agent(jnp.array([[1.0, 2], [3, 4], [5, 6]]))
+    assert obs["world_state"].tolist() == [[1, 2, 3, 4, 5, 6], [3, 4, 5, 6, 1, 2], [5, 6, 1, 2, 3, 4]]
+    assert obs["drone_1"].tolist() == [3, 4]
 
 
 def test_an_agent_is_done_from_its_own_end_on(env_of):
@@ -66,6 +66,18 @@ def test_an_agent_is_done_from_its_own_end_on(env_of):
     info |= dict(terminated=jnp.array([True, False]), active=jnp.ones(2, bool))
     dones = jaxmarl.wrap(env)._outcome(jnp.zeros((2, env.observation_size)), None, jnp.zeros(2), no[0], no[0], info)[3]
     assert jax.tree.map(bool, dones) == {"drone_0": True, "drone_1": False, "__all__": False}
+    dones = jaxmarl.wrap(env)._outcome(jnp.zeros((2, env.observation_size)), None, jnp.zeros(2), no[0], ~no[0], info)[3]
+    assert dones["__all__"]  # at the time limit
+
+
+def test_a_given_state_follows_when_the_episode_of_the_team_has_ended(env_of):
+    env, old, begun = jaxmarl.wrap(env_of("leader-follower")), jnp.zeros(2), jnp.ones(2)
+    env.get_obs = lambda state: state
+    for over in False, True:
+        dones = {"drone_0": not over, "drone_1": True, "__all__": jnp.array(over)}
+        env.step_env = lambda key, state, actions, dones=dones: (state, state, {}, dones, {})
+        obs, state, *_ = jaxmarl.JaxMARLEnv.step.__wrapped__(env, KEY, old, {}, begun)
+        assert (obs == over).all() and (state == over).all()
 
 
 @pytest.mark.slow

@@ -52,6 +52,14 @@ def test_a_picture_is_of_the_drones_that_are_still_in_the_world():
     for found in camera([*near, left], [True, True, False]), camera([left, *near], [False, True, True]):
         np.testing.assert_allclose(found, expected)
     np.testing.assert_allclose(camera(near, [False, False]), expected)
+    eye, center = camera([[0.0, 0, 1]], [True])
+    assert np.linalg.norm(eye - center) > 1  # of a single drone, too
+
+
+def test_a_picture_before_the_first_reset_is_refused():
+    assert pictures.wanted("rgb_array", True)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        pictures.wanted("rgb_array", False)
 
 
 @pytest.mark.slow

@@ -15,9 +15,10 @@ from jaxdrones.firmware.crazyflie.commander import LEVEL_AFTER, OFF_AFTER, Comma
 from jaxdrones.firmware.crazyflie.firmware import Crazyflie
 from jaxdrones.firmware.crazyflie.high_level import HighLevel
 from jaxdrones.firmware.crazyflie.log import TOC, Log
-from jaxdrones.firmware.crazyflie.packet import E2BIG, EEXIST, ENOENT, MAX_DATA, Packet, Port, decode, encode
+from jaxdrones.firmware.crazyflie.packet import E2BIG, EEXIST, ENOENT, ENOMEM, MAX_DATA, Packet, Port, decode, encode
 from jaxdrones.firmware.crazyflie.parameters import GAINS, Parameters
 from jaxdrones.firmware.crazyflie.planner import Goal, go_to
+from jaxdrones.firmware.crazyflie.server import Server
 from jaxdrones.firmware.crazyflie.supervisor import Supervisor
 from jaxdrones.firmware.crazyflie.toc import TYPES, Toc
 from jaxdrones.firmware.crazyflie.variables import VARIABLES, Readings
@@ -61,6 +62,7 @@ def test_a_table_is_described_by_its_size_and_its_checksum():
     assert answers[0] == answers[1] != answers[2]
     assert Toc({"a.b": 7}).answer(struct.pack("<BH", 2, 0)) == b"\2\0\0\7a\0b\0"
     assert Toc({"a.b": 7}).answer(struct.pack("<BH", 2, 1)) == bytes([2, ENOENT])
+    assert Toc({f"a.{i}": 1 for i in range(300)}).answer(b"\1")[:2] == b"\1\xff"  # of older clients, in a byte
 
 
 def test_numbers_are_limited_to_their_type():
@@ -152,6 +154,14 @@ def test_mistakes_with_blocks_have_error_numbers():
     assert log.answer(1, b"") == b""
 
 
+def test_a_client_has_16_blocks_and_128_variables_at_most():
+    log, one = Log(), variable("pm.state", "int8_t")
+    assert [log.answer(1, bytes([6, number]) + one)[2] for number in range(17)] == [0] * 16 + [ENOMEM]
+    log.answer(1, b"\5")
+    assert [log.answer(1, bytes([6, number]) + 26 * one)[2] for number in range(5)] == [0] * 4 + [ENOMEM]
+    assert log.answer(1, b"\6\5" + 24 * one)[2] == 0
+
+
 def test_logged_angles_and_rates_are_degrees_and_accelerations_multiples_of_gravity():
     now = Readings(SAMPLE, motors_off(), 0)
     read = {name: variable.read(now) for name, variable in VARIABLES.items()}
@@ -159,6 +169,20 @@ def test_logged_angles_and_rates_are_degrees_and_accelerations_multiples_of_grav
     assert [read[f"stabilizer.{axis}"] for axis in ("roll", "pitch", "yaw")] == [10, 11, 12]
     assert (read["acc.z"], read["stateEstimate.az"]) == pytest.approx((1, 0))
     assert [read[f"stateEstimate.v{axis}"] for axis in "xyz"] == [4, 5, 6]
+    assert read["range.zrange"] == 3000  # mm
+
+
+def test_logged_accelerations_are_in_world_axes():
+    to_the_right = dataclasses.replace(SAMPLE, quat=np.array([0.5**0.5, 0, 0, 0.5**0.5]))  # rolled by a quarter
+    now = Readings(to_the_right, motors_off(), 0)
+    found = [VARIABLES[f"stateEstimate.a{axis}"].read(now) for axis in "xyz"]
+    np.testing.assert_allclose(found, [0, -1, -1], atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "bit"), [("armed", 1), ("canfly", 3), ("isFlying", 4), ("isTumbled", 5)])
+def test_states_of_the_supervisor_are_logged(name, bit):
+    read = VARIABLES[f"sys.{name}"].read
+    assert [read(Readings(SAMPLE, motors_off(), 1 << k)) for k in range(10)] == [k == bit for k in range(10)]
 
 
 def make_commander():
@@ -178,6 +202,8 @@ def test_hover_set_points_go_along_the_heading_and_hold_the_height():
     np.testing.assert_allclose(found.setpoint.vel, [0.1, 0.2, 0])
     assert found.setpoint.by_pos.tolist() == [False, False, True] and found.setpoint.pos[2] == 0.5
     assert generic(5, 0.1, 0.2, 90.0, 0.5).yaw_rate == pytest.approx(-math.pi / 2)  # legacy: clockwise
+    assert generic(2, 0.0, 0.0, 90.0, 0.5).yaw_rate == pytest.approx(-math.pi / 2)
+    assert generic(9, 0.0, 0.0, 90.0, 0.5).yaw_rate == pytest.approx(math.pi / 2)
 
 
 def test_velocities_and_positions_are_in_the_world():
@@ -220,8 +246,9 @@ def test_a_full_state_has_a_position_in_mm_and_its_heading_in_a_compressed_attit
         quat /= np.linalg.norm(quat)
         assert abs(decompress(compress(quat)) @ quat) > 1 - 1e-5
     quat = np.array([0, 0, math.sin(0.4), math.cos(0.4)])
-    found = generic(6, 1000, -2000, 500, *[0] * 6, compress(quat), 0, 0, 0, form="hhhhhhhhhIhhh")
+    found = generic(6, 1000, -2000, 500, 100, -200, 50, 0, 0, 0, compress(quat), 0, 0, 0, form="hhhhhhhhhIhhh")
     np.testing.assert_allclose(found.setpoint.pos, [1, -2, 0.5])
+    np.testing.assert_allclose(found.setpoint.vel, [0.1, -0.2, 0.05])
     assert found.setpoint.rpy[2] == pytest.approx(0.8, abs=2e-3)
 
 
@@ -237,6 +264,13 @@ def test_thrust_is_locked_until_it_was_zero_and_its_yaw_rate_is_clockwise():
     found = rpyt(commander, roll=10, pitch=20, yaw=90, thrust=65000)
     assert found.setpoint.thrust == 60000 and found.yaw_rate == pytest.approx(-math.pi / 2)
     np.testing.assert_allclose(np.rad2deg(found.setpoint.rpy[:2]), [10, -20])
+
+
+def test_a_yaw_angle_is_counterclockwise_in_its_mode():
+    commander = make_commander()
+    commander._parameters.values["flightmode.stabModeYaw"] = 1.0
+    found = rpyt(commander, yaw=90)
+    assert found.yaw_given and found.setpoint.rpy[2] == pytest.approx(math.pi / 2)
 
 
 @pytest.mark.parametrize("by_rate", [(False, False), (True, False), (False, True), (True, True)])
@@ -260,6 +294,13 @@ def test_without_set_points_the_vehicle_levels_and_then_stops():
     assert level.setpoint.by_pos[2] and level.setpoint.pos[2] == pytest.approx(0.4)
     off = commander.target(OFF_AFTER + 0.01)
     assert off.setpoint.thrust_given and off.setpoint.thrust == 0
+
+
+def test_the_last_set_point_of_a_stream_holds_for_the_time_that_its_end_says():
+    commander = make_commander()
+    commander.generic(0, struct.pack("<Bffff", 10, 0.5, 0.0, 0.0, 0.4), 0.0)
+    commander.generic(1, struct.pack("<BI", 0, 5000), 0.1)
+    assert commander.target(5.0).setpoint.vel[0] == 0.5 and commander.target(5.2).setpoint.thrust_given
 
 
 @pytest.mark.parametrize(
@@ -295,6 +336,37 @@ def test_a_stream_ends_a_plan_and_a_plan_waits_for_the_end_of_a_stream():
     commander.generic(1, struct.pack("<BI", 0, 0), 3.2)
     plan(commander, 7, "ff?f", 1.0, 0.0, False, 2.0, t=3.3)
     assert commander.target(5.4).setpoint.pos[2] == pytest.approx(1.0)
+
+
+def test_heights_and_headings_may_be_relative():
+    commander, yaw = make_commander(), math.radians(12)  # that of the drone
+    for kind, height, reached in (9, 1.0, 1.0), (10, 0.4, 0.6):
+        plan(commander, kind, "f?f?f", height, True, 0.3, kind == 9, 0.5, t=3.0 * kind)
+        end = commander.high_level.trajectory.at(3.0 * kind + 2)
+        assert end.pos[2] == pytest.approx(reached) and end.yaw == pytest.approx(yaw if kind == 9 else 0.3)
+    plan(commander, 12, "??fffff", True, False, 0.0, 0.0, 0.0, 0.2, 1.0, t=33.0)
+    assert commander.high_level.trajectory.at(34.0).yaw == pytest.approx(0.5)
+
+
+def test_commands_for_other_groups_are_not_for_this_drone():
+    commander = make_commander()
+    commander.plan(b"\0\2", 0.0, SAMPLE)
+    for group, flies in (4, False), (6, True):
+        assert commander.plan(struct.pack("<BBff?f", 7, group, 1.0, 0.0, False, 2.0), 0.0, SAMPLE)[3] == 0
+        assert (commander.high_level.trajectory is not None) == flies
+
+
+def test_a_trajectory_may_begin_at_the_heading_of_the_drone():
+    commander, yaw = make_commander(), math.radians(12)
+    piece = np.zeros(33, "<f4")
+    piece[24], piece[-1] = 0.5, 2.0  # its heading and its duration
+    commander.high_level.memory[:132] = piece.tobytes()
+    plan(commander, 6, "BBIB", 1, 0, 0, 1)
+    for relative in True, False:
+        data = struct.pack("<BB???Bf", 13, 0, False, relative, False, 0, 1.0)
+        assert commander.plan(data, 0.0, dataclasses.replace(SAMPLE, pos=np.zeros(3)))[3] == 0
+        assert commander.high_level.trajectory.at(1.0).yaw == pytest.approx(yaw if relative else 0.5)
+        commander.off()
 
 
 def test_after_a_landing_the_motors_stop():
@@ -351,6 +423,37 @@ def test_the_vehicle_tumbles_locks_and_recovers():
     assert supervisor.can_fly
     supervisor.watch(level, 3.1, 0.01)  # the watchdog was not repeated
     assert supervisor.locked and not supervisor.can_fly
+
+
+def test_the_state_tells_whether_motors_turn_and_has_its_low_byte_first():
+    supervisor = Supervisor()
+    still = dataclasses.replace(SAMPLE, motors=np.zeros(4))
+    assert [supervisor.status(x, False, False) >> 4 & 1 for x in (SAMPLE, still)] == [1, 0]
+    assert supervisor.answer(0, b"\x0c", 0.0, 0x0102) == b"\x8c\2\1"
+
+
+def test_eight_clients_are_answered_until_one_is_silent_for_five_seconds():
+    vehicle: Any = SimpleNamespace(gains=firmware_pid.gains(), sample=SAMPLE, advance=lambda target: SAMPLE)
+    crazyflie = Crazyflie(vehicle)
+
+    def heard(client, now):
+        return len([*crazyflie.answer(Packet(Port.LINK, 1, b""), client, now)]) > 0
+
+    assert [heard(client, 0.1 * client) for client in range(9)] == [True] * 8 + [False]
+    for now, free in (4.9, False), (5.0, True):
+        assert not [*crazyflie.advance(now)] and heard("new", now) == free
+
+
+def test_there_is_one_memory_of_4096_bytes_for_trajectories():
+    crazyflie = Crazyflie(SimpleNamespace(gains=firmware_pid.gains(), sample=SAMPLE))
+    asked = (crazyflie.answer(Packet(Port.MEMORY, 0, data), "client", 0.0) for data in (b"\1", b"\2\0"))
+    (*_, number), (about,) = map(list, asked)
+    assert number.data == b"\1\1" and about.data == struct.pack("<BBBIQ", 2, 0, 0x12, 4096, 0)
+
+
+def test_a_crazyflie_is_reached_from_this_computer_only():
+    with Server(SimpleNamespace(), 0) as server:
+        assert server._socket.getsockname() == ("127.0.0.1", server.port)
 
 
 def test_what_is_written_to_the_memory_is_read_up_to_the_size_of_a_packet():

@@ -1,6 +1,8 @@
 """Packets and MSP: bytes as Betaflight's C structures have them, and signs as its axes have them."""
 
+import contextlib
 import dataclasses
+import socket
 import struct
 
 import jax.numpy as jnp
@@ -10,8 +12,10 @@ import pytest
 from jaxdrones import load_params
 from jaxdrones.envs import make
 from jaxdrones.errors import UserError
-from jaxdrones.firmware.betaflight import Simulation, Sticks, msp, settings, sticks_for
+from jaxdrones.firmware import drone
+from jaxdrones.firmware.betaflight import Simulation, Sticks, TakeOff, link, msp, settings, sticks_for
 from jaxdrones.firmware.betaflight.packets import motor_order, motor_outputs, rc_packet, state_packet
+from jaxdrones.firmware.betaflight.pilots import Flip
 from jaxdrones.firmware.drone import Sample
 from jaxdrones.tasks.hover import hover
 from jaxdrones.training.betaflight_pilot import PolicyPilot
@@ -137,7 +141,7 @@ def test_answers_are_found_in_any_pieces_and_between_other_bytes(size):
     rng = np.random.default_rng(size)
     frames = [msp.Frame(int(rng.integers(256)), rng.bytes(int(rng.integers(255)))) for _ in range(20)]
     noise = [b"", b"$", b"$M", b"#\r\n", b"$M>\x05\x01ab", b"$$M"]
-    stream = b"".join(noise[i % 4] + msp.encode(f.command, f.data, b">") for i, f in enumerate(frames))
+    stream = b"".join(noise[i % len(noise)] + msp.encode(f.command, f.data, b">") for i, f in enumerate(frames))
     decoder, found = msp.Decoder(), []
     for at in range(0, len(stream), size):
         found += decoder.feed(stream[at : at + size])
@@ -152,13 +156,70 @@ def test_a_wrong_checksum_is_no_answer_and_a_refusal_is_one_that_says_so():
     assert list(decoder.feed(msp.encode(101, b"", b"!"))) == [msp.Frame(101, b"", failed=True)]
 
 
+@pytest.fixture
+def board():
+    """Both ends of a connection of MSP."""
+    with contextlib.ExitStack() as stack:
+        yield tuple(map(stack.enter_context, socket.socketpair()))
+
+
+def test_a_request_waits_for_its_own_answer(board):
+    ours, theirs = board
+    answers = iter([msp.encode(101, b"other", b">"), msp.encode(102, b"own", b">"), msp.encode(103, b"", b"!")])
+    client = msp.Client(ours, lambda: theirs.sendall(next(answers)))
+    assert client.request(102, b"a") == b"own" and theirs.recv(100) == msp.encode(102, b"a")
+    with pytest.raises(msp.NoAnswer, match="Betaflight rejected MSP request 103"):
+        client.request(103)
+    with pytest.raises(msp.NoAnswer, match="Betaflight closed the MSP connection"):
+        msp.Client(ours, theirs.close).request(104)
+
+
+KEPT = {msp.SET_RC_TUNING: msp.RC_TUNING, msp.SET_PID: msp.PID, msp.SET_FAILSAFE: msp.FAILSAFE}
+KEPT |= {msp.SET_ADVANCED: msp.ADVANCED, msp.SET_FILTERS: msp.FILTERS}
+
+
+class Board:
+    """Flight controller that keeps its settings, and answers with them."""
+
+    def __init__(self):
+        self.settings = {command: bytes(range(1, 50)) for command in KEPT.values()}
+
+    def request(self, command, data=b""):
+        if data:
+            self.settings[KEPT.get(command, command)] = data
+        return self.settings.get(command, b"")
+
+
+@pytest.mark.parametrize("reversed_yaw", [False, True])
+def test_settings_that_were_read_are_changed_only_where_they_must_be(reversed_yaw):
+    board, racer = Board(), load_params("racer")
+    before = dict(board.settings)
+    assert [settings.configure(board, racer, 1000, reversed_yaw) for _ in range(2)] == [True, False]
+    changed = {
+        command: [i for i, x in enumerate(data) if x != before[command][i]]
+        for command, data in board.settings.items()
+        if command in before and command != msp.RC_TUNING
+    }
+    assert changed == {
+        msp.PID: [6],
+        msp.FAILSAFE: [0],
+        msp.ADVANCED: [1],
+        msp.FILTERS: [0, *range(20, 24), *range(29, 33)],
+    }
+    assert all(len(board.settings[command]) == 49 for command in changed)
+    assert board.settings[msp.ADVANCED][1] == 8000 // 2000  # loops at twice the rate of the states
+    assert board.settings[msp.SET_MIXER] == bytes([3, reversed_yaw])
+    tuning = board.settings[msp.RC_TUNING]
+    assert [10 * tuning[i] for i in (0, 2, 3, 4, 11, 12)] == [settings.MAX_RATE] * 6
+
+
 STATUS = struct.pack("<HHHIBHBB", 125, 0, 35, 1, 0, 12, 4, 0)
 
 
 def test_the_status_tells_whether_it_is_armed_and_why_not():
     now = settings.parse_status(STATUS + b"\x00" + struct.pack("<BI", 29, 1 << 7 | 1 << 12) + b"\0" * 4)
     assert now == settings.Status(True, 125, ("throttle", "calibrating"))
-    more = settings.parse_status(STATUS + b"\x02ab" + struct.pack("<BI", 29, 1 << 28))
+    more = settings.parse_status(STATUS + b"\xf2ab" + struct.pack("<BI", 29, 1 << 28))
     assert more.reasons == ("arm switch",)
 
 
@@ -171,6 +232,51 @@ def test_a_status_of_another_version_is_a_lack_of_an_answer(data):
 def test_switches_act_above_1700_us():
     slot, mode, channel, first, last = settings.mode_range(1, 1, 1)
     assert (slot, mode, channel, 900 + 25 * first, 900 + 25 * last) == (1, 1, 1, 1700, 2100)
+
+
+def sample(roll_rate=0.0):
+    return Sample(np.zeros(3), LEVEL, np.zeros(3), np.array([roll_rate, 50.0, 50.0]), np.zeros(4), np.zeros(3))
+
+
+def test_the_second_pilot_begins_at_its_own_time_zero():
+    pilot = TakeOff(lambda t, _: ("first", t), lambda t, _: ("then", t), after=4.0)
+    assert [pilot(t, None) for t in (3.0, 4.0, 5.5)] == [("first", 3.0), ("then", 0.0), ("then", 1.5)]
+
+
+def test_a_flip_is_a_climb_and_three_quarters_of_a_roll_at_full_stick():
+    racer, other = load_params("racer"), Sticks(yaw=0.5)
+    flip = Flip(racer, lambda t, _: other, at=1.0)
+    assert flip(0.99, sample(10.0)) == other
+    assert flip(1.2, sample(10.0)) == sticks_for(racer, 2 * float(racer.weight), np.zeros(3))
+    rolled = [flip(1.35 + 0.01 * k, sample(10.0)).roll for k in range(60)]
+    assert rolled == [1.0] * 49 + [0.0] * 11  # 0.1 rad a step, until 0.75 of a turn, 4.71 rad
+
+
+def test_a_long_flight_keeps_its_last_rows(monkeypatch):
+    monkeypatch.setattr(drone, "_MOST_ROWS", 3)
+    recorder = drone.Recorder()
+    for k in range(5):
+        recorder.add(float(k), sample())
+    assert recorder.log(load_params("racer"), {"vehicle": "racer"}, "").t.tolist() == [2, 3, 4]
+
+
+def test_twice_as_fast_as_the_clock_is_a_factor_of_two():
+    assert (drone.Pace(4.0, 2.0).real_time_factor, drone.Pace().real_time_factor) == (2, 0)
+
+
+def test_a_drone_stands_on_the_ground_below_it():
+    """With the center of its collision shape above its center of mass, that is lower by as much."""
+    racer = load_params("racer")
+    heights = [float(drone.on_ground(racer.replace(collision_offset=x)).pos[0, 2]) for x in (0.0, 0.01)]
+    assert heights[0] - heights[1] == pytest.approx(0.01) and heights[1] > 0
+    fallen = drone.on_ground(racer).replace(pos=np.array([[1.0, 2.0, 3.0]]), aux={"charge": np.ones(1)})
+    stands = drone.set_upright(racer, fallen)
+    np.testing.assert_allclose(stands.pos, drone.on_ground(racer, 1.0, 2.0).pos)
+    assert stands.aux == fallen.aux
+
+
+def test_betaflight_is_reached_from_this_computer_only():
+    assert link.HOST == "127.0.0.1"
 
 
 def test_a_policy_faster_than_the_sticks_is_refused():

@@ -58,6 +58,22 @@ def test_the_legend_names_the_flights_and_what_is_dashed_and_can_be_read_at_half
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height
 
 
+def test_bands_and_distances_are_those_of_all_drones(record):
+    """Of which one flew 2 cm away, and the other 5 cm."""
+    pos = np.float32([[0.02, 0, 0], [0.05, 0, 0]])
+    flown = dataclasses.replace(record, pos=record.target_pos + pos, target_vel=np.full_like(record.vel, np.nan))
+    with style.figure(4, 4) as figure:
+        error, apart = figure.subplots(2)
+        comparison._draw_errors(error, {"one": flown}, colors(1), 0.0)
+        comparison._draw_distance(apart, flown, moved(flown, -pos), 0.0)
+    (band,) = error.collections
+    edges = band.get_paths()[0].vertices[:, 1]
+    np.testing.assert_allclose(
+        [edges.min(), edges.max(), *apart.lines[0].get_ydata()[:1]], [0.02, 0.05, 0.05], rtol=1e-3
+    )
+    assert (error.get_title("left"), error.get_ylabel()) == ("distance to the target", "error (m)")
+
+
 def test_a_spike_of_one_flight_does_not_flatten_the_errors(record, tmp_path, figures):
     pos = record.pos.copy()
     pos[3] += 100.0

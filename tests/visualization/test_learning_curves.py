@@ -5,7 +5,7 @@ import pytest
 from helpers import mostly_slow
 
 from jaxdrones.visualization import learning_curves
-from jaxdrones.visualization.learning_curves import save_curves, spread
+from jaxdrones.visualization.learning_curves import PANELS, save_curves, spread
 
 
 def history(seed, updates=12):
@@ -53,6 +53,10 @@ def test_a_figure_is_drawn_of_any_number_of_runs(runs, tmp_path):
 def test_a_run_that_was_never_evaluated_is_drawn(tmp_path):
     save_curves({"seed 0": history(0, updates=2)}, tmp_path / "curve.png", "a title")
     assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_panels_say_what_was_evaluated():
+    assert [name for name, label in PANELS.items() if "evaluated" not in label] == ["reward"]
 
 
 @pytest.fixture

@@ -14,8 +14,22 @@ from jaxdrones.visualization.palette import colors
 
 def test_every_quantity_of_the_state_has_a_panel(record):
     assert len(plots.PANELS) == 16  # position, velocity, angles, rates, four motors
-    for array, column, _ in plots.PANELS.values():
+    units = {"pos": "(m)", "vel": "(m/s)", "rpy": "(rad)", "omega": "(rad/s)", "rpm": "(RPM)"}
+    axes = {"rpy": ("roll", "pitch", "yaw"), "rpm": ("P0", "P1", "P2", "P3")}
+    for array, column, label in plots.PANELS.values():
         assert np.isfinite(getattr(record, array)[:, :, column]).all()
+        name, unit = label.split()
+        assert name.endswith(axes.get(array, "xyz")[column]) and unit == units[array]
+
+
+def test_the_command_of_a_velocity_is_a_velocity(record):
+    flown = dataclasses.replace(record, target_vel=np.full_like(record.vel, 0.3))
+    with style.figure(3, 3) as figure:
+        axis = figure.subplots()
+        plots._draw_signal(axis, flown, "vy", colors(2))
+    dashed, line = axis.lines[2:]
+    assert dashed.is_dashed() and (dashed.get_ydata() == flown.target_vel[0, 0, 0]).all()
+    np.testing.assert_array_equal(line.get_ydata(), flown.vel[:, 1, 1])
 
 
 PANELS = [(), ("z",), ("z", "vz", "rpm0"), ("x", "vx", "z", "vz"), plots.POLICY_PANELS]
@@ -60,7 +74,7 @@ def test_the_legend_names_every_drone_and_explains_what_is_dashed(record, tmp_pa
 
 def test_a_panel_holds_nearly_all_samples_and_says_what_it_leaves_out(record, tmp_path, figures):
     rpm = np.full_like(record.rpm, 14_000)
-    rpm[0] = 30_000
+    rpm[0, 0] = rpm[1, 1] = 30_000
     plots.save_flight(dataclasses.replace(record, rpm=rpm), tmp_path / "flight.png", "a title", ("rpm0",))
     axis = figures[0].axes[-1]
     low, high = axis.get_ylim()
@@ -86,11 +100,29 @@ def test_a_team_of_many_drones_is_a_median_with_bands(record, tmp_path, figures)
 
 
 @pytest.mark.parametrize(
-    ("extent", "plane"), [((1, 1, 0.1), (0, 1)), ((1, 0, 0.5), (0, 2)), ((0, 1, 2), (1, 2)), ((0, 0, 1), (0, 2))]
+    ("extent", "plane"),
+    [((1, 1, 0.1), (0, 1)), ((1, 0, 0.5), (0, 2)), ((0, 1, 2), (1, 2)), ((0, 0, 1), (0, 2)), ((1, 0, 0), (0, 1))],
 )
 def test_the_path_is_drawn_in_the_plane_in_which_it_is_largest(extent, plane):
     t = np.linspace(0, 1, 50)[:, None]
     assert paths.widest_plane((np.sin(7 * t + [0, 1, 2]) * extent)[:, None]) == plane
+
+
+@pytest.mark.parametrize(
+    ("axes", "title", "labels"), [([0, 1, 2], "above", ("x", "y")), ([2, 0, 1], "the side", ("y", "z"))]
+)
+def test_a_plane_is_named_with_its_axes(axes, title, labels, record):
+    flown = dataclasses.replace(record, pos=record.pos[..., axes], target_pos=record.target_pos[..., axes])
+    with style.figure(3, 3) as figure:
+        axis = figure.subplots()
+        paths.prepare_plane(axis, [flown])
+    assert axis.get_title("left") == f"path from {title}"
+    assert (axis.get_xlabel(), axis.get_ylabel()) == tuple(f"{label} (m)" for label in labels)
+
+
+def test_a_path_in_space_ends_where_the_panel_does():
+    path = np.array([[0.0, 0, 0], [0, 9, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(paths._inside(path, [(-1, 1)] * 3), [[0, 0, 0], [np.nan] * 3, [1, 1, 1]])
 
 
 def test_outlines_of_obstacles_have_their_area():

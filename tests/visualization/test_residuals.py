@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.visualization import style
-from jaxdrones.visualization.residuals import save_paths
+from jaxdrones.visualization.residuals import save_errors, save_paths
 
 
 def flight(name, shift, height):
@@ -33,4 +33,17 @@ def test_panels_are_squares_that_hold_all_paths_and_the_record_is_on_top(figures
             x, y = line.get_data()
             assert left < x.min() and x.max() < right and low < y.min() and y.max() < high
         assert [line.get_label() for line in axis.lines][-1] == "recorded"
+        x, y = next(line for line in axis.lines if line.get_label() == "cf2x, simulated").get_data()
+        assert abs(np.mean(x) - np.mean(y)) < 0.05 and np.ptp(y) < 2.01  # both shifted alike, of the ellipse
         assert {"cf2x, simulated", "runs/fit, simulated"} <= {line.get_label() for line in axis.lines}
+
+
+def test_errors_are_drawn_after_their_times_with_their_units(figures, monkeypatch):
+    monkeypatch.setattr(style, "save", lambda figure, path: None)
+    table = np.arange(12.0).reshape(3, 4)
+    save_errors({"flight.npz": table}, Path("errors.png"))
+    (figure,) = figures
+    titles = ["position (m)", "velocity (m/s)", "attitude (rad)", "rates (rad/s)"]
+    for i, (axis, title) in enumerate(zip(figure.axes, titles, strict=True)):
+        assert axis.get_title("left") == title and axis.get_xlabel() == "after (s)"
+        np.testing.assert_allclose(axis.lines[0].get_xydata(), np.column_stack([[0.1, 0.25, 0.5], table[:, i]]))

@@ -28,7 +28,13 @@ def test_a_spike_in_the_first_sample_does_not_flatten_the_axis():
     lines = waves(0)
     without = np.ptp(style.limits(lines))
     lines[0] = 1e4
-    assert np.ptp(style.limits(lines)) < 2 * without
+    low, high = style.limits(lines)
+    assert high - low < 2 * without and low == pytest.approx(lines.min() - (high - low) / 22)  # no space below
+
+
+def test_numbers_at_an_axis_are_whole_and_not_from_an_offset():
+    with style.figure(1, 1) as figure:
+        assert not figure.subplots().yaxis.get_major_formatter().get_useOffset()
 
 
 def test_everything_is_shown_where_nothing_stands_out():

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.arguments import choice, whole
-from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.common import check_writable, folder, print_warning
 from jaxdrones.cli.options import add_output, option, parse_pixels, switch
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import described, print_results
@@ -92,8 +92,8 @@ def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[st
     if options.video:
         films.film_page(page, options.video, options.fps, options.size, options.camera)
         files.append(options.video)
-    if options.open:
-        webbrowser.open(files[0].absolute().as_uri())
+    if options.open and not webbrowser.open(output.absolute().as_uri()):
+        print_warning("no browser was found; open the page in one")
     wrote = ", ".join(f"{file} ({file.stat().st_size / 1e6:.1f} MB)" for file in files)
     print_results(options, about | {"files": [*map(str, files)]}, f"wrote {wrote}")
     return 0

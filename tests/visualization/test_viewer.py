@@ -295,6 +295,13 @@ def test_a_film_that_cannot_be_is_refused_before_its_flight_is_read(arguments, s
     assert says in capsys.readouterr().err
 
 
+def test_a_page_that_no_browser_opens_is_said(record, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("webbrowser.open", lambda url: False)
+    save_npz(record, tmp_path / "log.npz")
+    assert main(["view", str(tmp_path), "--open"]) == 0
+    assert "no browser was found; open the page in one" in capsys.readouterr().err
+
+
 def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(record, tmp_path, capsys):
     """As `runs/compare/*` holds a figure beside the logs; but not one that is not there, a damaged log, or all."""
     for name in "one", "other":

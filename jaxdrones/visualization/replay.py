@@ -23,9 +23,11 @@ def frames(record: FlightLog, fps: int, size: tuple[int, int]) -> Generator[np.n
 
 
 def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequence:
-    """Write the images of every drone's camera as `drone 0/00000.png` etc.; return them."""
+    """Write the images of every drone's camera as `drone 0/00000.png` etc., in place of earlier ones; return them."""
     from matplotlib.image import imsave
 
+    for earlier in folder.glob(f"*/{5 * '[0-9]'}.png"):
+        earlier.unlink()
     t, pictures = [], []
     with bullet.make_step(scene=record.scene) as step:
         for frame, row in enumerate(rows_of_frames(record, fps)):

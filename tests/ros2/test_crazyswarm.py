@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-pytestmark = [pytest.mark.needs("rclpy"), pytest.mark.filterwarnings("default")]
+pytestmark = pytest.mark.filterwarnings("default")
 
 
 class Swarm:
@@ -22,8 +22,9 @@ class Action:
 
 
 @pytest.fixture
-def backend(ros):
-    import rclpy
+def backend(request):
+    rclpy = pytest.importorskip("rclpy")
+    request.getfixturevalue("ros")
     from rosgraph_msgs.msg import Clock
 
     from jaxdrones.ros2.crazyswarm import Backend
@@ -55,6 +56,30 @@ def hover_rpm():
 
     speeds = np.linspace(10_000, 25_000, 200_001)
     return speeds[np.argmin(np.abs(thrust_of(speeds) - 0.027 * 9.8 / 4))]
+
+
+def test_motors_are_numbered_from_the_front_right_one_clockwise():
+    from jaxdrones.ros2.crazyswarm import _rotors_of_motors
+
+    front_left, front_right, rear_right, rear_left = (1, 1), (1, -1), (-1, -1), (-1, 1)
+    places = 0.03 * np.array([front_left, rear_left, front_right, rear_right])
+    assert _rotors_of_motors(places).tolist() == [3, 2, 0, 1]
+
+
+def test_a_motor_that_stands_still_has_no_thrust():
+    from jaxdrones.ros2.crazyswarm import thrust_of
+
+    assert thrust_of(np.zeros(4)).tolist() == [0] * 4
+
+
+def test_an_attitude_of_crazyswarm_has_its_scalar_first():
+    from jaxdrones.ros2.crazyswarm import _from_swarm
+
+    start = Swarm([1.0, 2.0, 3.0])
+    start.quat = 2 * np.array([0.8, 0.0, 0.6, 0.0])
+    state = _from_swarm([start], float)
+    np.testing.assert_allclose(state.quat, [[0, 0.6, 0, 0.8]])
+    np.testing.assert_array_equal(state.pos, [[1, 2, 3]])
 
 
 def test_time_goes_by_dt_and_the_clock_is_published(backend):

@@ -92,6 +92,14 @@ def test_the_clock_goes(record, lens):
     assert all(np.abs(a - b).max() > 100 for a, b in itertools.pairwise(corner))
 
 
+def test_trails_of_a_crowd_are_of_two_seconds(record):
+    overlay = Overlay(record, "", 1.0)
+    assert len(overlay._path(0, 300)) == 301
+    overlay._colors = 7 * overlay._colors
+    path = overlay._path(0, 300)
+    np.testing.assert_array_equal(path[[0, -1]], record.pos[[60, 300], 0])  # of 120 rows a second
+
+
 @pytest.mark.slow
 def test_drones_cast_shadows_on_the_ground(record):
     """Where the shadow of a drone falls it is darker than in other frames, unless something is drawn over it."""
@@ -169,9 +177,21 @@ GRAY = np.full((32, 48, 3), 128, np.uint8)
 @pytest.mark.needs("imageio_ffmpeg")
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_frames_of_a_script_become_a_film_in_a_new_folder(suffix, tmp_path):
+    from PIL import Image
+
     path = tmp_path / "new" / f"film{suffix}"
     assert video.write((GRAY for _ in range(3)), str(path), fps=5) == 3
     assert path.stat().st_size > 100
+    if suffix == ".gif":
+        with Image.open(path) as picture:
+            assert picture.n_frames * picture.info["duration"] == 600  # ms
+
+
+def test_the_progress_of_a_film_is_the_share_of_its_frames(record, tmp_path, monkeypatch):
+    monkeypatch.setattr(films, "_frames", lambda *_: (GRAY for _ in range(6)))
+    shares = []
+    films.film(record, tmp_path / "film.gif", "a title", "jax", FPS, on_frame=shares.append)  # of 3 s
+    assert shares == [(k + 1) / 6 for k in range(6)]
 
 
 @pytest.mark.needs("imageio_ffmpeg")

@@ -66,6 +66,7 @@ def test_a_lens_projects_what_a_camera_sees_onto_the_same_pixel():
         point = eye + depth * np.array([1, rays.u[0, column], rays.v[row, 0]]) @ axes
         pixel, away = lens.project(point)
         np.testing.assert_allclose([*pixel, away], [column + 0.5, row + 0.5, depth], rtol=1e-9)
+    assert np.isnan(lens.project(2 * eye - target)[0]).all()  # behind the camera
 
 
 @pytest.fixture(scope="module", params=FLIGHTS)

@@ -59,7 +59,7 @@ def test_sticks_are_in_the_order_roll_pitch_throttle_yaw_and_switches():
 
 def test_sticks_end_at_their_ends_and_numbers_that_are_none_are_the_center():
     assert channels(roll=9.0, pitch=-9.0, throttle=2.0, yaw=float("nan"))[:4] == (2000, 1000, 2000, 1500)
-    assert channels(throttle=float("nan"))[2] == 1000
+    assert channels(throttle=float("nan"))[2] == channels(throttle=-1.0)[2] == 1000
 
 
 def motors(*pulses, count=4):
@@ -96,6 +96,22 @@ def test_a_plus_and_rotors_that_turn_alike_are_refused(monkeypatch):
     )
     with pytest.raises(UserError, match="give alternating ones"):
         Simulation("racer")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_each_rotor_has_the_output_of_its_motor_and_yaw_is_that_of_the_motor_rear_right(sign, monkeypatch):
+    racer = load_params("racer")
+    racer, commanded = racer.replace(rotor_spin=sign * racer.rotor_spin), []
+    monkeypatch.setattr("jaxdrones.firmware.betaflight.simulation.load_params", lambda name: racer)
+    with monkeypatch.context() as patched:
+        patched.setattr(Simulation, "advance", lambda self, outputs: None)
+        simulation = Simulation("racer")
+    simulation._advance = lambda team, state, rpm: commanded.append(rpm) or (state, np.zeros(20))
+    simulation.advance(np.array([0.1, 0.2, 0.3, 0.4]))
+    outputs = {(-1, -1): 0.1, (1, -1): 0.2, (-1, 1): 0.3, (1, 1): 0.4}  # by the signs of x and y
+    places = [tuple(np.sign(pos[:2]).astype(int).tolist()) for pos in np.asarray(racer.rotor_pos)]
+    np.testing.assert_allclose(commanded[0] / racer.max_rpm, [outputs[place] for place in places], rtol=1e-6)
+    assert simulation.reversed_yaw == (racer.rotor_spin[places.index((-1, -1))] < 0)
 
 
 def test_sticks_for_rates_push_the_way_the_drone_turns():

@@ -46,6 +46,8 @@ def test_twists_are_in_body_axes_and_poses_in_the_world():
     assert sent["odom"].child_frame_id == sent["twist"].header.frame_id == "drone_0/base_link"
     forward = jd.rotation.rotate(simulation.state.quat[0], jnp.array([1.0, 0, 0]))
     np.testing.assert_allclose(sent["twist"].twist.linear.x, simulation.state.vel[0] @ forward, rtol=1e-12)
+    in_body = convert.to_body(np.asarray(simulation.state.quat), np.asarray(simulation.state.vel))
+    np.testing.assert_allclose(in_body, now.vel, rtol=1e-12)  # as of a log
     assert sent["odom"].twist.twist == sent["twist"].twist and sent["odom"].pose.pose == sent["pose"].pose
 
 
@@ -85,7 +87,9 @@ def test_the_camera_matrix_projects_as_the_camera_renders():
 
 def test_an_image_message_holds_the_pixels_row_by_row():
     rgb = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
-    image = convert.image_messages(rgb, Camera(resolution=(3, 2)), 0, 0)["camera/image_raw"]
+    image, info = convert.image_messages(rgb, Camera(resolution=(3, 2)), 0, 0).values()
+    assert image.header.frame_id == info.header.frame_id == "drone_0/camera_optical_frame"
+    assert (info.k[2], info.k[5]) == (1, 0.5)  # the middle of the image, where the center of the first pixel is 0, 0
     assert (image.height, image.width, image.step, image.encoding) == (2, 3, 9, "rgb8")
     np.testing.assert_array_equal(np.frombuffer(image.data, np.uint8).reshape(2, 3, 3), rgb[..., :3])
 
@@ -159,5 +163,6 @@ def test_drones_and_their_topics_have_the_names_of_the_table():
 
 def test_a_battery_without_a_capacity_has_no_known_percentage():
     """It was a division by zero."""
-    state = convert._battery({"voltage": 4.0, "charge": 0.0, "capacity": 0.0}, msg.Header(convert.stamp(0), "base"))
-    assert math.isnan(state.percentage) and state.capacity == 0
+    reading = {"voltage": 4.0, "current": 2.0, "charge": 0.0, "capacity": 0.0}
+    state = convert._battery(reading, msg.Header(convert.stamp(0), "base"))
+    assert math.isnan(state.percentage) and state.capacity == 0 and state.current == -2  # it is discharged

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,9 +11,11 @@ from helpers import assert_close, mostly_slow
 from in_process import InProcess, Peer, Wire, positions
 from ros2_team import HZ, make_simulation, nanoseconds, team_step
 
+import jaxdrones as jd
 from jaxdrones.errors import UserError
-from jaxdrones.ros2 import Failsafe, Node, PeerLost, convert, topics
+from jaxdrones.ros2 import Command, Failsafe, Mode, Node, PeerLost, Simulation, convert, topics
 from jaxdrones.ros2 import messages as msg
+from jaxdrones.ros2.failsafe import Watch, sink
 from jaxdrones.sensing import Camera
 
 pytestmark = pytest.mark.needs("rosbags")
@@ -26,8 +29,9 @@ def make_node(wire, n=2, **options):
 
 def test_every_step_is_published_once_for_every_drone():
     wire = Wire()
-    node, _ = make_node(wire)
+    node, _ = make_node(wire, speed=2.0)
     flown = node.run(0.2)
+    assert wire.now == pytest.approx(0.1, abs=0.01)
     stamps = [nanoseconds(message.clock) for message in wire.sent["clock"]]
     assert stamps == [k * 10_000_000 for k in range(21)]
     for i in range(2):
@@ -132,6 +136,27 @@ def test_drones_of_a_lost_peer_land_and_the_flight_ends():
     assert flown.landed and flown.steps < 20 * HZ
     last = [sent[-1] for sent in (positions(wire, 0), positions(wire, 1))]
     assert all(0 < p.z < 0.06 for p in last)
+
+
+def test_time_is_that_of_the_control_steps_at_any_rate():
+    assert Simulation.ns.fget(SimpleNamespace(steps=7, control_hz=3)) == 2_333_333_333
+
+
+def test_the_first_command_has_a_timeout_of_its_own():
+    watch = Watch(Failsafe(timeout=1.0, wait=30.0), 5.0)
+    assert watch.remaining(6.0) == 29 and not watch.hear(6.0) and watch.remaining(6.5) == 0.5
+
+
+def test_a_landing_sinks_by_40_cm_per_s_to_the_ground_where_the_rotors_stop():
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    params = params.replace(collision_offset=np.array([0.01]))
+    ground = float(params.collision_height[0]) / 2 - 0.01
+    command = Command.zero(Mode.POSITION, pos=[0.1, 0.2, 0.9])
+    sinking = sink(command, params, jd.State.at_rest([[0.1, 0.2, 1.0]]), 0, 0.5)
+    np.testing.assert_allclose(sinking.pos, [0.1, 0.2, 0.7])
+    low = sink(sinking, params, jd.State.at_rest([[0.1, 0.2, 0.1]]), 0, 9.0)
+    np.testing.assert_allclose(low.pos, [0.1, 0.2, ground])
+    assert sink(low, params, jd.State.at_rest([[0.1, 0.2, ground + 0.02]]), 0, 0.5).mode == Mode.MOTORS
 
 
 def test_a_flight_stops_with_its_peer_if_asked_to():
@@ -244,9 +269,7 @@ def test_a_slow_computer_is_counted_and_not_caught_up_with():
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_flies_behind_the_same_topics():
-    import jaxdrones as jd
     from jaxdrones.engine import bullet
-    from jaxdrones.ros2 import Simulation
 
     wire = Wire()
     params = jd.repeat(jd.load_params("cf2x"), 1)

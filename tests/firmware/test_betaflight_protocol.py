@@ -13,7 +13,7 @@ from jaxdrones import load_params
 from jaxdrones.envs import make
 from jaxdrones.errors import UserError
 from jaxdrones.firmware import drone
-from jaxdrones.firmware.betaflight import Simulation, Sticks, TakeOff, link, msp, settings, sticks_for
+from jaxdrones.firmware.betaflight import Hover, Simulation, Sticks, TakeOff, link, msp, settings, sticks_for
 from jaxdrones.firmware.betaflight.packets import motor_order, motor_outputs, rc_packet, state_packet
 from jaxdrones.firmware.betaflight.pilots import Flip
 from jaxdrones.firmware.drone import Sample
@@ -252,6 +252,12 @@ def test_switches_act_above_1700_us():
 
 def sample(roll_rate=0.0):
     return Sample(np.zeros(3), LEVEL, np.zeros(3), np.array([roll_rate, 50.0, 50.0]), np.zeros(4), np.zeros(3))
+
+
+def test_the_outer_loop_commands_a_force_from_a_thrust_per_mass(monkeypatch):
+    racer = load_params("racer")
+    monkeypatch.setattr("jaxdrones.firmware.betaflight.pilots._command", lambda *_: (2 * racer.gravity, np.ones(3)))
+    assert Hover(racer)(0.0, sample()) == sticks_for(racer, 2 * float(racer.weight), np.ones(3))
 
 
 def test_the_second_pilot_begins_at_its_own_time_zero():

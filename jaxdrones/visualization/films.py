@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -33,7 +34,7 @@ def check_size(name: str, size: Any) -> None:
         raise UserError(f"{name} is {short_repr(size)}; give width and height, two even numbers of pixels")
 
 
-def choose_renderer(renderer: str | None, path: Path) -> str:
+def choose_renderer(renderer: str | None, path: str | os.PathLike) -> str:
     """Renderer of a film, by default the page if there is a browser, else JAX.
 
     Raises:
@@ -53,7 +54,7 @@ def choose_renderer(renderer: str | None, path: Path) -> str:
 @checked
 def film(
     record: FlightLog,
-    path: Path,
+    path: str | os.PathLike,
     title: str,
     renderer: str | None = None,
     fps: Count = FPS,
@@ -98,7 +99,7 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
 @checked
 def film_page(
     page: Page,
-    path: Path,
+    path: str | os.PathLike,
     fps: Count = FPS,
     size: Annotated[tuple[int, int], check_size] = SIZE,
     camera: Annotated[str, choice("camera", CAMERAS)] = "orbit",

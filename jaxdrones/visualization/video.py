@@ -16,8 +16,9 @@ SUFFIXES = (".mp4", ".gif")
 _FASTEST_GIF = 50  # frames per second; browsers show a frame of less than 2/100 s for 1/10 s
 
 
-def check_video(path: Path, fps: int = 1) -> None:
+def check_video(path: str | os.PathLike, fps: int = 1) -> None:
     """Raise `ValueError` for an unknown suffix, too many frames per second or a package that is not installed."""
+    path = Path(path)
     if path.suffix not in SUFFIXES:
         raise UserError(f"{path}: films end in {' or '.join(SUFFIXES)}")
     if path.suffix == ".gif" and fps > _FASTEST_GIF:

@@ -190,7 +190,7 @@ def test_frames_of_a_script_become_a_film_in_a_new_folder(suffix, tmp_path):
 def test_the_progress_of_a_film_is_the_share_of_its_frames(record, tmp_path, monkeypatch):
     monkeypatch.setattr(films, "_frames", lambda *_: (GRAY for _ in range(6)))
     shares = []
-    films.film(record, tmp_path / "film.gif", "a title", "jax", FPS, on_frame=shares.append)  # of 3 s
+    films.film(record, str(tmp_path / "film.gif"), "a title", "jax", FPS, on_frame=shares.append)  # of 3 s
     assert shares == [(k + 1) / 6 for k in range(6)]
 
 

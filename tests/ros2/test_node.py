@@ -13,7 +13,7 @@ from ros2_team import HZ, make_simulation, nanoseconds, team_step
 
 import jaxdrones as jd
 from jaxdrones.errors import UserError
-from jaxdrones.ros2 import Command, Failsafe, Mode, Node, PeerLost, Simulation, convert, topics
+from jaxdrones.ros2 import Command, Failsafe, Mode, Node, PeerLost, Simulation, command, convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.failsafe import Watch, sink
 from jaxdrones.sensing import Camera
@@ -140,6 +140,29 @@ def test_drones_of_a_lost_peer_land_and_the_flight_ends():
 
 def test_time_is_that_of_the_control_steps_at_any_rate():
     assert Simulation.ns.fget(SimpleNamespace(steps=7, control_hz=3)) == 2_333_333_333
+
+
+def test_images_are_due_at_the_start_and_at_the_rate_of_the_camera():
+    flights = [SimpleNamespace(_flight=SimpleNamespace(control_hz=100, steps=k)) for k in range(9)]
+    due = [Node._image_is_due(flight, Camera(resolution=(8, 6), rate=25.0)) for flight in flights]
+    assert [k for k, is_due in enumerate(due) if is_due] == [0, 4, 8]
+
+
+def test_a_commanded_velocity_is_along_the_heading_that_turns_by_the_yaw_rate(monkeypatch):
+    seen = []
+
+    def followed(gains, params, memory, state, setpoint, dt):
+        seen.append(setpoint)
+        return memory, np.zeros(4)
+
+    monkeypatch.setitem(command.CONTROLLERS, "own", SimpleNamespace(gains=lambda: None, control=followed))
+    monkeypatch.setattr(command.rates, "follow", lambda *_: np.zeros(4))
+    state = jd.State(*(np.eye(4)[3, 4 - size :] for size in (3, 4, 3, 3, 4)))
+    given, memory = Command.zero(Mode.VELOCITY, vel=[1.0, 2.0, 3.0], yaw_rate=2.0), command.Memory((), np.array(0.5))
+    after, _ = command.control("own", None, memory, state, given, 0.1)
+    cos, sin = np.cos(0.7), np.sin(0.7)
+    np.testing.assert_allclose(seen[0].vel, [cos - 2 * sin, sin + 2 * cos, 3], rtol=1e-6)
+    assert after.heading == pytest.approx(0.7)
 
 
 def test_the_first_command_has_a_timeout_of_its_own():

@@ -63,6 +63,11 @@ def test_fields_are_those_of_the_message_definitions_of_ros(name):
         assert defined == [field.name for field in msg.fields(name)]
 
 
+@pytest.mark.needs("rosbags")
+def test_a_rotation_is_none_where_it_is_not_given():
+    assert msg.Pose().orientation == msg.Quaternion(0.0, 0.0, 0.0, 1.0)
+
+
 def test_every_topic_has_a_standard_message_type():
     for kind, _ in (topics.OUTPUTS | topics.COMMANDS).values():
         assert dataclasses.is_dataclass(msg.message_class(kind)) and kind in msg.MESSAGES

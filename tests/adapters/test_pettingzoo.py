@@ -97,6 +97,13 @@ def test_an_agent_leaves_when_it_is_terminated_or_cut():
             assert list(found.values()) == flag.tolist()
 
 
+def test_infos_are_those_of_each_drone(env_of):
+    env, both = parallel_env(env_of("hover", drones=2, duration=0.05)), {"drone_0": 0, "drone_1": 0}
+    info = {"rewards": {"a": np.array([1.0, 2.0])}, "metrics": {}, "terminations": {}, "truncations": {}}
+    env._step = lambda actions: ((both, {}, {}, {}), None, info)
+    assert env.step({})[4] == {"drone_0": {"reward_a": 1.0}, "drone_1": {"reward_a": 2.0}}
+
+
 def test_every_step_of_an_episode_has_a_key_of_its_own():
     env = SimpleNamespace(step=lambda key, world, action: (jax.random.key_data(key).tolist(), world))
     first, second = (_advance(env, jax.random.key(0), SimpleNamespace(step=k), None)[1][0] for k in range(2))

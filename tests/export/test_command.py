@@ -103,6 +103,7 @@ def test_order_unit_and_frame_of_every_number_are_in_the_comment(to, run, env, t
         )
     assert [int(row[0]) for row in rows] == [*range(22), *range(4)]
     assert "Hidden state: 6 numbers, kept between calls; 0 at the start of a flight" in comment
+    assert {"c": "policy_reset(hidden);", "js": "const hidden = initialHiddenState();"}[to] in comment
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")

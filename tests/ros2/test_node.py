@@ -182,6 +182,19 @@ def test_a_landing_sinks_by_40_cm_per_s_to_the_ground_where_the_rotors_stop():
     assert sink(low, params, jd.State.at_rest([[0.1, 0.2, ground + 0.02]]), 0, 0.5).mode == Mode.MOTORS
 
 
+def test_a_flight_has_landed_when_all_drones_have():
+    params = jd.repeat(jd.load_params("cf2x"), 2)
+    off, held = Command.zero(Mode.MOTORS), Command.zero(Mode.POSITION, pos=[0.0, 0.0, 1.0])
+    state = jd.State.at_rest([[0.0, 0.0, 1.0]] * 2)
+    watch = SimpleNamespace(lost=True, lose=lambda now: False)
+    for commands, landed in ([off, held], False), ([off, off], True):
+        flight = SimpleNamespace(drones=2, commands=commands, params=params, state=state)
+        node = SimpleNamespace(_flight=flight, _watches=[watch] * 2, _clock=lambda: 0.0, flown=SimpleNamespace())
+        node._failsafe = Failsafe("land")
+        Node._guard(node, 0.01)
+        assert node.flown.landed == landed
+
+
 def test_a_flight_stops_with_its_peer_if_asked_to():
     wire = Wire()
     node, _ = make_node(wire, failsafe=Failsafe("stop", wait=0.5))

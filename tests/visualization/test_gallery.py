@@ -11,7 +11,7 @@ from viewer_payload import decode
 from jaxdrones import assets
 from jaxdrones.cli import live, main
 from jaxdrones.visualization import browser
-from jaxdrones.visualization.viewer.page import read_exhibits
+from jaxdrones.visualization.viewer.page import Exhibit, gallery, read_exhibits
 
 CHOSEN = "document.querySelector('[aria-current]')"
 OWN = """
@@ -154,3 +154,7 @@ def test_every_flight_plays_without_a_message_and_fits(page, width):
             tab.wait(f"{frame}.srcdoc.includes({exhibit.payload[:200]!r})")
         assert tab.run("document.documentElement.scrollWidth") <= width
         assert tab.problems == []
+
+
+def test_no_text_of_a_flight_ends_the_script_of_the_page():
+    assert "</script>a" not in gallery([Exhibit("</script>a", "", "", "")])

@@ -97,6 +97,8 @@ def test_a_film_that_ffmpeg_cannot_write_is_one_line_and_leaves_the_old_one(
 def test_frames_are_in_step_with_simulated_time(record):
     rows = shots.rows_of_frames(record, fps=10)
     assert len(rows) == 15
+    late = dataclasses.replace(record, t=record.t + np.float64(1000.0))  # by the time of the day
+    assert np.abs(shots.rows_of_frames(late, fps=10) - rows).max() <= 1
     assert [*rows[1:]] == [round(frame / 10 * 120) - 1 for frame in range(1, 15)]  # row k is at (k + 1) / 120 s
 
 
@@ -118,6 +120,7 @@ def test_every_drone_leaves_its_pictures(record, tmp_path):
 def test_an_unknown_kind_of_film_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"flight\.avi: films end in \.mp4 or \.gif"):
         video.check_video(tmp_path / "flight.avi")
+    video.check_video(tmp_path / "flight.gif", 50)
 
 
 def test_without_ffmpeg_the_error_names_the_extra(monkeypatch, tmp_path):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.sensing import Camera, Cylinder, Scene, Sphere, images, ray, room
+from jaxdrones.sensing import Box, Camera, Cylinder, Scene, Sphere, images, ray, room
 from jaxdrones.visualization.overlay import Lens
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, _distance, shoot
 
@@ -117,6 +117,8 @@ def test_a_flight_that_fits_is_filmed_by_a_camera_that_stands_still(circle):
     assert np.ptp(shot.eyes, axis=0).max() == 0 and np.ptp(shot.targets, axis=0).max() == 0
 
 
-def test_obstacles_that_hide_nothing_stay(circle):
-    scene = jax.device_get(Scene.of(Sphere(pos=(0.0, 0.0, -0.5), radius=0.1), Sphere(pos=(0.0, 3.0, 0.5), radius=0.1)))
-    assert shoot(dataclasses.replace(circle, scene=scene), 24, 16 / 9).scene.count == 2
+def test_obstacles_that_hide_nothing_stay_and_a_roof_is_left_out(circle):
+    balls = Sphere(pos=(0.0, 0.0, -0.5), radius=0.1), Sphere(pos=(0.0, 3.0, 0.5), radius=0.1)
+    roof = Box(pos=(0.0, 0.0, 0.2 + circle.pos[..., 2].max()), size=(30.0, 30.0, 0.1))
+    scene = shoot(dataclasses.replace(circle, scene=jax.device_get(Scene.of(*balls, roof))), 24, 16 / 9).scene
+    assert scene.count == 2 and {type(solid) for solid in scene.numbered.values()} == {Sphere}

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from html import unescape
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +26,8 @@ from jaxdrones.flights import read_log, save_npz
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
-from jaxdrones.visualization.viewer import show
-from jaxdrones.visualization.viewer.show import records_of
+from jaxdrones.visualization.viewer import payload, show
+from jaxdrones.visualization.viewer.show import records_of, show_history
 
 ARRAYS = ("pos", "quat", "vel", "omega", "rpm")
 SCENE = Scene.of(
@@ -328,6 +329,18 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
         assert main(["view", str(tmp_path / "one"), *(str(tmp_path / x) for x in others), *page]) == 2
         assert message in capsys.readouterr().err
     assert main(["view", *skipped, *page]) == 2 and "is a flight" in capsys.readouterr().err
+
+
+def test_every_array_begins_at_a_whole_number_of_four_bytes():
+    """As typed arrays of a browser must."""
+    arrays = payload._Arrays()
+    assert [arrays.add_bytes(np.zeros(3, np.uint8))["offset"], arrays.add(np.zeros(3))["offset"]] == [0, 4]
+
+
+def test_policies_of_a_training_are_named_with_their_success(record):
+    evaluated = [SimpleNamespace(update=3, value=0.875, flight=record)]
+    (world,) = header(show_history(evaluated, 3, "success", "a title"))["worlds"]
+    assert world["name"] == "update 3: success 87.5 %"
 
 
 def test_loads_on_cables_are_in_the_page_and_in_a_log(team, tmp_path):

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from helpers import mostly_slow
 
-from jaxdrones.cli import main
+from jaxdrones.cli import bench, common, compare, main
 from jaxdrones.cli.flight_options import warn
+from jaxdrones.cli.options import parse_pixels
 from jaxdrones.cli.report import listed, summary, table
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.fly import fly
@@ -83,6 +84,31 @@ def test_csv_and_pwm_come_on_request(tmp_path):
 def test_a_flight_of_several_that_diverges_is_named(capsys):
     assert (warn({}, "pid"), warn({"drone 0": "drone 0 is upside down"}, "pid")) == (0, 1)
     assert "the flight of pid diverged: drone 0 is upside down" in capsys.readouterr().err
+    warn({"drone 0": "drone 0 is upside down", "drone 1": "drone 1 is upside down"})
+    assert "drone 0 is upside down (and 1 more)" in capsys.readouterr().err
+
+
+def test_a_long_message_keeps_its_beginning_and_its_end():
+    assert common.shortened(600 * "a" + "\n" + 600 * "b") == f"{500 * 'a'} ... {500 * 'b'}"
+
+
+def test_pixels_are_width_and_height():
+    assert parse_pixels("--size", "64x48", "") == (64, 48)
+
+
+def test_the_line_to_share_has_the_best_rate_of_each_kind():
+    rows = [{"what": "plant", "worlds": worlds, "per_s": rate} for worlds, rate in ((1, 2e6), (8, 3e6), (9, 1e6))]
+    about = {"versions": dict.fromkeys(("jaxdrones", "jax", "jaxlib", "python"), "1"), "dtype": "float32"}
+    line = bench._line(about | {"rates": rows, "devices": ["cpu: cpu"], "processor": "fast", "cores": 2})
+    assert line.startswith("jaxdrones bench: plant 3 M steps/s (8 worlds); float32; fast, 2 cores;")
+
+
+def test_a_controller_is_as_good_as_on_its_worst_drone_if_all_settle(monkeypatch):
+    drones = [
+        {"rms_error_m": x, "lowest_z_m": x, "settled_after_s": y} for x, y in ((1.0, 2.0), (3.0, None), (2.0, 1.0))
+    ]
+    monkeypatch.setattr(compare.results, "results", lambda record, after: drones)
+    assert compare._results({"pid": None}, 0.0) == [{"controller": "pid", "rms_error_m": 3.0, "settled_after_s": None}]
 
 
 @pytest.mark.slow

@@ -228,6 +228,7 @@ def test_rewards_and_statistics_of_learners_are_those_of_the_drones_that_fly():
     assert trajectory.terminated[:, :, 0].sum() == 2 and trajectory.truncated[:, :, 1].sum() == 2
 
 
+@pytest.mark.slow  # the quick one of tests/learning/test_learners.py asks the same of a whole update
 @pytest.mark.float32
 def test_ppo_does_not_learn_from_steps_after_the_end_of_a_drone():
     """Whatever the numbers of those steps are, the advantages and the loss are the same."""

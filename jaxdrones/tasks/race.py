@@ -26,7 +26,7 @@ _FINISH = 1.5  # m, between the last gate and the points behind it
 _WIDE = 1.0  # m, edge of the opening that counts without contact
 _FAR = 100.0  # m, between drones that left the race
 _MARGIN, _SOFTNESS = 0.06, 0.03  # m: gap to an obstacle below which the reward falls
-_FLYING = 0.5  # share of the random starts in flight
+_IN_FLIGHT, _FLYING = 0.8, 0.75  # shares of random starts in flight, and of the drones in these that fly
 _FIRST = 1.0  # m along the track: the first of the random starts in flight
 _BETWEEN = 0.35, 2.0  # m along the track between drones that start in flight: in sight of each other or not
 _MIN_SPEED, _RETURN = 1.5, 3.0  # m/s, and 1/s: of the desired velocity
@@ -60,8 +60,8 @@ def race(
         level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles. The policy
             does not observe the poles.
         laps: number of laps of four gates, at most 100.
-        random_start: for training: each drone starts in flight with probability 0.5, all of them one behind the other
-            near a random place of the track, else on the ground at the start.
+        random_start: for training: with probability 0.8 the start is in flight, one behind the other near a random
+            place of the track, for three of four drones; the others start on the ground at the start of the track.
         contact: whether there are contact forces of ground and drones, gates and poles end a race, and only flights
             through the opening of a gate count. Training disables it: fewer physics steps, and longer episodes.
         acceleration: largest acceleration of the observed desired velocity, along the centerline and across it, m/s^2.
@@ -82,7 +82,8 @@ def race(
         state, index = _grid(grid_key, params, origin), jnp.zeros(n, jnp.int32)
         if random_start:
             flying, place = _in_flight(flight_key, params, line, total)
-            flies = jax.random.bernoulli(flying_key, _FLYING, (n,))
+            world_key, drone_key = jax.random.split(flying_key)
+            flies = jax.random.bernoulli(world_key, _IN_FLIGHT) & jax.random.bernoulli(drone_key, _FLYING, (n,))
             state = jax.tree.map(lambda x, y: jnp.where(flies[:, None], x, y), flying, state)
             index = jnp.where(flies, place, index)
         zero = jnp.zeros(n, dtype)

@@ -26,7 +26,7 @@ def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequen
     """Write the images of every drone's camera as `drone 0/00000.png` etc., in place of earlier ones; return them."""
     from matplotlib.image import imsave
 
-    for earlier in folder.glob(f"*/{5 * '[0-9]'}.png"):
+    for earlier in folder.glob(f"drone */{5 * '[0-9]'}.png"):
         earlier.unlink()
     t, pictures = [], []
     with bullet.make_step(scene=record.scene) as step:

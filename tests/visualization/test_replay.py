@@ -105,7 +105,8 @@ def test_frames_are_in_step_with_simulated_time(record):
 @pytest.mark.needs("pybullet")
 def test_every_drone_leaves_its_pictures(record, tmp_path):
     """At the times of the log, also of one by the time of the day."""
-    for name in "drone 1/00099.png", "drone 5/00000.png", "drone 5/my.png":  # of an earlier and longer flight
+    earlier = "drone 1/00099.png", "drone 5/00000.png"  # of a longer flight
+    for name in *earlier, "drone 5/my.png", "mine/00000.png":
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     late = dataclasses.replace(record, t=record.t + np.float64(1000.0))
@@ -114,7 +115,10 @@ def test_every_drone_leaves_its_pictures(record, tmp_path):
     np.testing.assert_allclose(images.t, late.t[0] + 0.25 * np.arange(6), rtol=1e-12)
     pictures = sorted((tmp_path / "drone 1").glob("*.png"))
     assert len(pictures) == 6 and imread(pictures[0]).shape == (48, 64, 4)
-    assert [file.name for file in (tmp_path / "drone 5").iterdir()] == ["my.png"]
+    assert [file.name for folder in ("drone 5", "mine") for file in (tmp_path / folder).iterdir()] == [
+        "my.png",
+        "00000.png",
+    ]
 
 
 def test_an_unknown_kind_of_film_is_refused(tmp_path):
